@@ -1,4 +1,4 @@
-"""The command line: options for the functions that the notebooks call."""
+"""The command line: its commands, their options, and how errors are told."""
 
 import argparse
 import importlib
@@ -17,14 +17,18 @@ from nbtrack.machinery.errors import ConfigError, NbtrackError, nearest_name
 
 
 def a_path(text: str) -> Path:
-    """A path, with `~` expanded. An empty text is refused: it would mean the working folder."""
+    """Parse a path, and expand `~`. An empty text, which would mean the working folder, is refused.
+
+    Raises what argparse reports as a user's error, as the other functions that parse an option.
+    """
     if not text.strip():
         raise argparse.ArgumentTypeError("the path is empty")
-    return Path(os.path.expanduser(text))  # of no such user: as it is, and refused where it is used
+    # The `~` of an unknown user stays, and is refused where the path is used.
+    return Path(os.path.expanduser(text))
 
 
 def a_count(text: str, minimum: int = 1, maximum: int = 2**31 - 1) -> int:
-    """Parse a whole number from `minimum` to `maximum`, by default what random generators take.
+    """Parse a whole number from `minimum` to `maximum`; the default is the largest seed.
 
     Another text raises what argparse reports as a user's error.
     """
@@ -97,8 +101,9 @@ _TRACKED = " --tracker --rate --steps --map-frames --map-from --start"
 _CELLS = "--budget --scenes --method:tables --beyond --seeds --workers --dask --preset"
 _CELLS += " --caption --label --no-still"
 _MODULES = {"tables": "bench", "bench": "bench", "export": "exports"}  # the others: "commands"
-# By name: what it does, and its options; a colon and a word choose one of two meanings. `map` is
-# done by the function `map_command`, `data make` by `make_command`.
+# Each command's help and the words of its options, which are keys of `OPTIONS`. A colon and a word
+# after an option choose one of its meanings. The function of the command `map` is `map_command`,
+# that of `data make` is `make_command`.
 COMMANDS = {
     "map": ("fit a field to a sequence with known poses", "sequence" + _MADE),
     "track": ("track a camera; maps first where no map fits", "sequence" + _MADE + _TRACKED),
@@ -114,10 +119,10 @@ COMMANDS = {
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, with the nearest name, as every other user error does."""
+    """A parser whose errors are ConfigErrors with one line, as all other errors of a user are."""
 
     def error(self, message: str) -> NoReturn:
-        """Raise an error that the caller catches; argparse would exit."""
+        """Raise ConfigError, where argparse would exit; it suggests the nearest of the choices."""
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             choices = [choice.strip("' ") for choice in wrong[2].split(",")]
             message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
@@ -127,9 +132,9 @@ class Parser(argparse.ArgumentParser):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit status.
 
-    It is 0, or 2 after a user's mistake, 130 after Ctrl-C, and 1 where `data check` finds a
-    recording wrong, or whoever read the output has closed it. With `NBTRACK_DEBUG` set, the
-    traceback of a mistake or of Ctrl-C is printed too.
+    The status is 0; 2 after a user's mistake; 130 after Ctrl-C; 1 if `data check` finds a recording
+    wrong, or if the program that reads the output has closed it. If `NBTRACK_DEBUG` is set, the
+    traceback of a mistake or of Ctrl-C is printed, too.
     """
     sys.stdout = _writable(sys.stdout)
     sys.stderr = _writable(sys.stderr)
@@ -142,24 +147,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         module = _MODULES.get(options.command, "commands")
         commands = importlib.import_module(f"nbtrack.experiments.{module}")
         status = getattr(commands, f"{options.command}_command")(options)
-        print(end="", flush=True)  # a closed pipe is found here, not after the return
+        print(end="", flush=True)  # raises BrokenPipeError here, and not when Python ends
         return status or 0
-    except BrokenPipeError:  # the reader of the output, such as `head`, has closed it
-        for descriptor in (1, 2):  # stdout and stderr: what Python flushes at its end is discarded
+    except BrokenPipeError:  # the program that reads the output, such as `head`, has closed it
+        for descriptor in (1, 2):  # stdout and stderr: discards what Python flushes when it ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
         return 1
     except (NbtrackError, OSError, MemoryError, KeyboardInterrupt) as error:
         if os.environ.get("NBTRACK_DEBUG"):
             traceback.print_exception(error)
         print(f"nbtrack: {_message_of(error)}", file=sys.stderr)
-        return 130 if isinstance(error, KeyboardInterrupt) else 2  # as shells say it
+        return 130 if isinstance(error, KeyboardInterrupt) else 2  # 130 is what shells return
 
 
 def _writable(stream: TextIO | None) -> TextIO:
-    """The stream, changed so that it takes every text; a stream to nowhere where it is None.
+    """The stream, changed so that every text can be written to it.
 
-    Python has None for a stream that is closed, as a daemon's is. Letters that the encoding lacks,
-    as those of a path, are escaped.
+    Letters that its encoding lacks, as in a path, are escaped. Python has None for a stream that is
+    closed, as a daemon's is; a stream that discards all text then takes its place.
     """
     if stream is None:
         stream = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
@@ -169,20 +174,20 @@ def _writable(stream: TextIO | None) -> TextIO:
 
 
 def _message_of(error: BaseException) -> str:
-    """The line in which a user is told what ended a command."""
+    """The line that tells a user what ended a command."""
     if isinstance(error, NbtrackError):
         return " ".join(str(error).split())
-    if isinstance(error, OSError):  # a disk that is full, a file where a folder should be
-        # The second name is the target of a file that was to be renamed.
+    if isinstance(error, OSError):  # as of a full disk, or of a file in place of a folder
+        # When a file is renamed, the second name is the new one.
         where = error.filename2 or error.filename or "the output"
         return f"{where}: {error.strerror or error}; mend it and run again"
-    if isinstance(error, MemoryError):  # where no job says what needs it
+    if isinstance(error, MemoryError):  # outside of jobs, which say what needs the memory
         return "out of memory: take fewer frames, as with --frames ::2"
     return f"interrupted; {str(error) or 'run the same command again to go on'}"
 
 
 def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """The options of a command line; ConfigError, with the nearest names, for a wrong one."""
+    """The options of a command line. A wrong line raises ConfigError with the nearest name."""
     parser = Parser(prog="nbtrack", description="RGB-D camera tracking in neural scenes.")
     parser.add_argument("--version", action="version", version=f"nbtrack {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
@@ -194,9 +199,9 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         command = group.add_parser(last, help=about, description=about)
         for word in [*words.split(), "--import"]:
             command.add_argument(word.partition(":")[0], **OPTIONS[word])
-        # Not every command has --device, and `main` asks for it.
+        # `main` asks for the device, but not every command has --device.
         command.set_defaults(command=last, parser=command, device=None)
-    # `parse_args` would report unknown ones itself, without the nearest name.
+    # `parse_args` would report unknown arguments itself, without the nearest name.
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
         given = unknown[0].partition("=")[0]

@@ -1,4 +1,4 @@
-"""The provenance of results: what keys of the cache are made of besides settings and data."""
+"""The provenance of results: code and versions, on which keys of the cache depend."""
 
 import importlib.metadata
 import importlib.util
@@ -21,34 +21,37 @@ _FOLDERS = (
     "tracking",
 )  # fmt: skip
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
-_COVERED = {"nbtrack", "torch", *sys.stdlib_module_names}  # by `package_code` and `versions`
+# Modules that `package_code` and `versions` already cover.
+_COVERED = {"nbtrack", "torch", *sys.stdlib_module_names}
+# Folders into which packages are installed.
 _SITE = (*site.getsitepackages(), site.getusersitepackages(), sysconfig.get_path("platlib"))
 
 
 @cache
 def package_code(*folders: str) -> str:
-    """Twelve hexadecimal digits that change with the files of some folders of this package."""
+    """Twelve hexadecimal digits that change with the Python files in folders of this package."""
     files = sorted(file for folder in folders for file in (PACKAGE / folder).rglob("*.py"))
     return fingerprint({str(file.relative_to(PACKAGE)): file.read_text("utf-8") for file in files})
 
 
 def code_fingerprint(kind: type) -> str:
-    """Twelve hexadecimal digits that change with the code of a field or tracker, and this package.
+    """Twelve hexadecimal digits for the code of a field or tracker class and of this package.
 
-    Of an installed package the version counts. Of a class from elsewhere, as a user's file, a
-    notebook or an editable installation, its qualified name and its own `version` count, and
-    nothing else; without a `version` the class itself does: nothing of it is kept for another
-    process, and a line says so.
+    They change with the files of this package, and with the version of the installed package that
+    the class is from. For a class from elsewhere, as a user's file, a notebook or an editable
+    installation, they change with its qualified name and its attribute `version`, but not with its
+    code. Without a `version` they are others in every process, so that no process uses results of
+    another one, and a printed line says so.
     """
     return fingerprint(package_code(*_FOLDERS), _code_of(kind))
 
 
 @cache
 def _code_of(kind: type) -> list[str]:
-    """What keys hold of a class besides the code of this package.
+    """Texts that stand for the code of a class outside of this package.
 
-    These are the installed distributions of the class and its bases, as names with versions. A
-    class of no distribution adds its own name and version.
+    They are the installed distributions of the class and of its bases, as names with versions. A
+    class that is from no distribution, and not from this package, adds its name and version.
     """
     installed = {base.__module__: _installed(base.__module__) for base in kind.__mro__}
     distributions = sorted({name for names in installed.values() for name in names})
@@ -56,7 +59,7 @@ def _code_of(kind: type) -> list[str]:
         return distributions
     name, version = f"{kind.__module__}.{kind.__qualname__}", vars(kind).get("version")
     if version is None:
-        version = secrets.token_hex(6)  # for this class object in this process
+        version = secrets.token_hex(6)  # stays for this class in this process, by `cache`
         advice = f'give {kind.__name__} version = "1", and another text whenever its code changes'
         tell(f"nbtrack: maps and runs with {name} are not kept for another process: {advice}")
     return [*distributions, name, str(version)]
@@ -64,7 +67,10 @@ def _code_of(kind: type) -> list[str]:
 
 @cache
 def _installed(module: str) -> list[str]:
-    """Name and version of the distributions that a module was installed by; none for others."""
+    """Names with versions of the distributions that installed a module.
+
+    Empty for a module that was not installed, and for those in `_COVERED`.
+    """
     top = module.partition(".")[0]
     file = getattr(sys.modules.get(module), "__file__", None) or ""
     if top in _COVERED or not file.startswith(_SITE):
@@ -74,8 +80,8 @@ def _installed(module: str) -> list[str]:
 
 
 def versions() -> dict[str, str]:
-    """Versions that a result depends on, to be kept beside it and in its key."""
+    """Versions by name of nbtrack, Python and the packages that compute results."""
+    found = {"nbtrack": nbtrack.__version__, "python": platform.python_version()}
+    found["torch"] = str(torch.__version__)
     installed = [name for name in _PACKAGES if importlib.util.find_spec(name)]
-    of_packages = {name: importlib.metadata.version(name) for name in installed}
-    own = {"nbtrack": nbtrack.__version__, "python": platform.python_version()}
-    return {**own, "torch": str(torch.__version__), **of_packages}
+    return found | {name: importlib.metadata.version(name) for name in installed}

@@ -1,4 +1,4 @@
-"""The commands that compute the paper's tables anew: `tables`, and `bench`, Table II alone."""
+"""The commands that compute the paper's tables: `tables`, and `bench` for Table II alone."""
 
 import os
 from argparse import Namespace
@@ -27,8 +27,8 @@ from nbtrack.synthetic import ROOMS
 from nbtrack.tracking import ClockBudget, StepBudget, Tracker, make_tracker
 from nbtrack.tracking.methods import Methods, find_methods
 
-_FRAMES_A_CELL = 3  # that a mean of steps in Table II is taken over
-# What a run's row tells beside its place; none of it depends on how fast the machine was.
+_FRAMES_A_CELL = 3  # the times that a frame is tracked for a mean number of steps in Table II
+# The columns of results that are written with the tables; none depends on the machine's speed.
 _CELL_COLUMNS = (
     "rate_hz", "method", "n_pixels", "scene", "seed", "ate_m", "ate_rmse_aligned_m",
     "rotation_rmse_deg", "max_error_m", "frames", "lost_frames", "steps_per_frame", "run",
@@ -37,37 +37,37 @@ _CELL_COLUMNS = (
 
 
 def tables_command(options: Namespace) -> None:
-    """Fill the tables of a preset and write them as CSV and LaTeX.
+    """Compute the tables of a preset, print them, and write them as CSV and LaTeX.
 
-    Raises NbtrackError at the end where cells failed, and left gaps.
+    Raises NbtrackError at the end if runs failed, whose cells are then empty.
     """
-    # A setting's value is TOML, where a list of texts looks as Python prints it.
+    # The value of a setting is TOML, which writes a list of texts as Python prints it.
     names = [f"scenes.names={options.scenes.split(',')}"] if options.scenes else []
     preset = load_preset(options.preset, options.config, [*options.settings, *names])
     usual = TABLE_3 if options.beyond else TABLE_1
     methods = find_methods(options.method.split(",") if options.method else usual)
-    # What is wrong is told before a room is made.
+    # All of the following raise an error for a wrong option, before a room is made.
     execution = Execution(options.workers, options.dask, keep_going=True)
     if options.label and (label := label_of(options.label)) != options.label:
         tell(f"nbtrack: LaTeX has no label {options.label!r}: it is {label!r} in the tables")
     wording = Wording(options.caption, options.label, dict(map(_label_of, preset.scenes.labels)))
     prepare(options.out)
     results = _fill_tables(options, preset, methods, execution, wording)
-    if failed := [*filter(None, results["failure"])]:
-        found = f"{len(failed)} cells of the table failed and are empty"
-        raise NbtrackError(f"{found}, the first because {failed[0]}; mend it and run again")
+    if failures := [failure for failure in results["failure"] if failure]:
+        found = f"{len(failures)} cells of the table failed and are empty"
+        raise NbtrackError(f"{found}, the first because {failures[0]}; mend it and run again")
 
 
 def _fill_tables(
     options: Namespace, preset: Preset, methods: Methods, execution: Execution, wording: Wording
 ) -> pd.DataFrame:
-    """Track what is missing, print and write the tables; returns the results, a row for each run.
+    """Make the runs that are missing, print and write the tables; returns a row for each run.
 
-    `wording` is what the user's LaTeX says in place of ours.
+    `wording` holds the user's caption, label and names of scenes for the LaTeX tables.
     """
     clock = options.budget == "clock"
     scenes = open_scenes(preset)
-    rates = RATES_3_HZ if options.beyond else None  # those of the preset
+    rates = RATES_3_HZ if options.beyond else None  # None: the preset's
     results = track_scenes(
         scenes, methods, preset, rates, clock=clock, seeds=range(options.seeds), execution=execution
     )
@@ -82,22 +82,25 @@ def _fill_tables(
         print(tables.style_table_1(shown))
         print("Table I beside the paper's")
         print(tables.beside_published(shown).to_string(float_format="%.3f", na_rep="–"))
-        # One scene is enough, the first without a gap: a step costs the same in all. Table II is
-        # always by the clock.
+        # A step costs the same in all scenes, so Table II needs only one: the first scene in which
+        # no run failed. Its budgets are always by the clock.
         failed = {*results.loc[results["failure"] != "", "scene"]}
         complete = next((scene for scene in scenes if scene.name not in failed), scenes[0])
         steps = _table_2(preset, complete, methods)
         pixels, by_clock = default_pixels(preset, methods), _note(preset, clock=True)
         paths = tables.write_tables(folder, shown, steps, note, pixels, by_clock, wording)
     cells = folder / f"table_{3 if options.beyond else 1}_cells.csv"
-    # With all digits: benchmarks/documents.py computes tables of the documents from such files.
+    # With all digits, because benchmarks/documents.py computes tables from such files.
     paths.append(tables.write_csv(cells, results.filter(_CELL_COLUMNS), float_format=None))
     print("\n".join(map(str, paths)))
     return results
 
 
 def _label_of(text: str) -> tuple[str, str]:
-    """From a `NAME=LABEL` text: the name that our tables print for a scene, and its LaTeX label."""
+    """The scene's name in our tables and its label in LaTeX, from a text `NAME=LABEL`.
+
+    Raises ConfigError for another text.
+    """
     name, equals, label = str(text).partition("=")
     if not equals:
         raise ConfigError(f"scenes.labels has {text!r}: write 'NAME=LABEL', as 'office=Office'")
@@ -106,10 +109,10 @@ def _label_of(text: str) -> tuple[str, str]:
 
 def bench_command(options: Namespace) -> None:
     """Measure and print Table II; write it as CSV."""
-    # The paper's sizes unless something else is asked for: small networks measure bookkeeping.
+    # Networks have the paper's sizes by default: with small ones the time of a step is overhead.
     name = options.preset or os.environ.get("NBTRACK_PRESET", "synthetic")
-    # The fewest images that a room may have, and hardly a map: a step costs the same whatever the
-    # weights are.
+    # A step costs the same whatever the images and the weights of the map are. So the room has the
+    # fewest images that are allowed, and the map is hardly trained.
     quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
     preset = load_preset(name, options.config, [*options.settings, *quick])
     prepare(options.out)
@@ -119,7 +122,7 @@ def bench_command(options: Namespace) -> None:
 
 
 def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
-    """Measure and print Table II; returns what `measure_steps` does."""
+    """Measure Table II and print it; returns the rows of `measure_steps`."""
     steps = measure_steps(preset, scene, methods)
     machine = f"{device_name(choose_device())}, {torch.get_num_threads()} threads"
     print(f"Table II: steps, {preset.name} networks, on {machine}")
@@ -128,20 +131,21 @@ def _table_2(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.Dat
 
 
 def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> pd.DataFrame:
-    """Steps within each budget, for every tracker and each n (pixels) that the preset lists for it.
+    """Count the steps of the trackers of some methods within time budgets, as in Table II.
 
-    A tracker works in the field of the first method that has it, in the scene's map, made if not
-    cached, and always on the scene's first frame with a pose.
+    Each tracker is measured with every n (pixels) that the preset lists for it. It tracks the
+    scene's first frame that has a pose, in the field of the first method that has the tracker. The
+    scene's map is made if it is not cached.
 
-    A row is a cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps (mean over frames),
-    steps_std (over frames), and converged: whether each frame's search ended before the budget.
-    Source: paper, Table II and evaluation protocol.
+    Returns a row for each cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps and
+    steps_std (mean and deviation over repetitions), and converged (whether every search ended
+    before the budget did). Source: paper, Table II and evaluation protocol.
     """
-    firsts = {}
+    method_of = {}
     for method in find_methods(methods):
-        firsts.setdefault(method.tracker, method)
+        method_of.setdefault(method.tracker, method)
     pixels, usual = preset.tables.pixels, preset.tables.pixels["sdf"]
-    plan = [(method, n) for method in firsts.values() for n in pixels.get(method.tracker, usual)]
+    plan = [(method, n) for method in method_of.values() for n in pixels.get(method.tracker, usual)]
     frame = read_frames(scene.recording, np.flatnonzero(scene.recording.has_pose)[:1])[0]
     columns = ["tracker", "n_pixels", "budget_ms", "steps", "steps_std", "converged"]
     rows = []
@@ -153,7 +157,7 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
             settings = replace(with_method.tracking_of(name), n_pixels=n_pixels)
             with advise_on_memory(f"tables.pixels.{name}={n_pixels}"):
                 field = map_scene(scene, method.field, with_method).field
-                # The budget is replaced for every cell.
+                # `_steps_within` replaces the budget.
                 tracker = make_tracker(name, field, frame.T_world_camera, StepBudget(1), settings)
                 for budget_ms in preset.tables.budgets_ms:
                     counts, converged = _steps_within(tracker, frame, budget_ms)
@@ -164,23 +168,26 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
 
 
 def _steps_within(tracker: Tracker, frame: Frame, budget_ms: float) -> tuple[list[int], bool]:
-    """The steps that a tracker takes for the frame within a budget, each time from the true pose.
+    """Track a frame several times from its true pose; returns the steps of each time.
 
-    Also returns whether it converged each time: it ended although one more step would have fitted
-    into the budget. A first time, in which it allocates and compiles, is not counted.
+    Also returns whether the tracker converged each time: it ended although one more step would have
+    fitted into the budget. The first time, in which it allocates and compiles, is left out.
     """
     tracker.budget = ClockBudget(1000 / budget_ms)  # Hz
-    counts, with_one_more = [], []
+    counts, seconds_with_one_more = [], []
     for _ in range(1 + _FRAMES_A_CELL):
         tracker.restart(frame.T_world_camera)
         estimate = tracker.track(frame)
         counts.append(estimate.steps)
-        with_one_more.append(estimate.seconds * (1 + 1 / max(estimate.steps, 1)))  # s
-    return counts[1:], 1000 * max(with_one_more[1:]) < budget_ms
+        seconds_with_one_more.append(estimate.seconds * (1 + 1 / max(estimate.steps, 1)))
+    return counts[1:], 1000 * max(seconds_with_one_more[1:]) < budget_ms
 
 
 def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]:
-    """The n that each tracker's first method uses for Table I, by its label in Table II."""
+    """The n (pixels) of Table I, by the trackers' labels in Table II.
+
+    It is the n of the first method that has the tracker.
+    """
     pixels = {}
     for method in find_methods(methods):
         settings = preset.with_method(method.settings).tracking_of(method.tracker)
@@ -189,7 +196,7 @@ def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]
 
 
 def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
-    """For captions: how the camera of some runs moves, and its mean motion from frame to frame."""
+    """A text for captions: how the camera moves in some runs, and how far from frame to frame."""
     are_rooms = set(preset.scenes.names) <= set(ROOMS)
     kind = f"Camera: {preset.scenes.motion if are_rooms else 'recorded'} motion"
     if "path_m" not in results:
@@ -199,9 +206,9 @@ def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
 
 
 def _note(preset: Preset, clock: bool) -> str:
-    """How the numbers were measured, in a sentence: preset, changed settings, budget, device."""
+    """A sentence on how the numbers were measured: preset, changed settings, budget, device."""
     changed = changed_settings(preset.settings, PRESETS[preset.name].settings)
-    # The table's columns name the scenes.
+    # Settings of the scenes' names are left out, since the table's columns have the names.
     changed = [text for text in changed if not text.startswith(("scenes.names", "scenes.labels"))]
     label = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
     budget = "wall clock" if clock else preset.step_counts

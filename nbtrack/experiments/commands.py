@@ -1,4 +1,5 @@
-"""What each command does; `tables` and `bench` stand in `bench.py`, `export` in `exports.py`."""
+"""The functions that commands call; those of `tables` and `bench` are in `bench.py`, that of
+`export` in `exports.py`."""
 
 import shlex
 from argparse import Namespace
@@ -31,12 +32,12 @@ from nbtrack.tracking import make_budget
 from nbtrack.tracking.methods import METHODS
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
-_FRAMES_APART = 10  # every tenth frame tells what of a mesh was seen: neighbours see the same
-_ERRORS = "ate_rmse_m", "max_error_m", "still_ate_m"  # of a run's summary
+_FRAMES_APART = 10  # a mesh shows what every tenth frame saw: frames in between see the same
+_ERRORS = "ate_rmse_m", "max_error_m", "still_ate_m"  # the metrics in a run's summary
 
 
 def methods_command(options: Namespace) -> None:
-    """List every method that --method takes, by tracker."""
+    """Print every method that --method takes, grouped by tracker."""
     notes = dict.fromkeys(TABLE_1, " (the paper's)") | {DEFAULT_METHOD: " (default)"}
     for tracker in dict.fromkeys(method.tracker for method in METHODS.values()):
         print(f"tracker {tracker}")
@@ -46,7 +47,7 @@ def methods_command(options: Namespace) -> None:
 
 
 def map_command(options: Namespace) -> None:
-    """Map a sequence, or resume; print the map's scores and where it and its mesh lie."""
+    """Map a sequence, or resume a killed mapping; print the scores and where the files are."""
     method = method_of(options.method, options.field, tracker=None)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     scene = _opened(options, preset)
@@ -67,10 +68,10 @@ def map_command(options: Namespace) -> None:
 
 
 def _write_mesh(job: MapJob, finished: Map) -> None:
-    """Write the mesh of what was seen beside a finished map, or print why there is none."""
+    """Write a mesh of what the mapped frames saw beside the map, or print why there is none."""
     try:
-        some = job.scene.select(job.frames)[::_FRAMES_APART]
-        seen = reading.without_outliers(reading.read_frames(job.scene.recording, some))
+        numbers = job.scene.select(job.frames)[::_FRAMES_APART]
+        seen = reading.without_outliers(reading.read_frames(job.scene.recording, numbers))
         mesh = extract_mesh(finished.field, seen)
     except DataError as error:
         print(f"  no mesh: {error}")
@@ -80,7 +81,7 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
 
 
 def track_command(options: Namespace) -> None:
-    """Track a sequence in its map, made first where none fits, or in a given one."""
+    """Track a sequence in a map that is given, or in its own, which is made if it is missing."""
     given = MapJob.of_given(options.map_from) if options.map_from else None
     field = given.field if given and not (options.field or options.method) else options.field
     method = method_of(options.method, field, options.tracker)
@@ -104,7 +105,8 @@ def track_command(options: Namespace) -> None:
     runs.prepare(options.out)
     if not given:
         _make_map(job)
-    # A finished run is made anew: recording and map may lie elsewhere now, and its times change.
+    # A finished run is made again: its files name the recording and the map, which may lie
+    # elsewhere now, and the seconds that it took.
     (run.folder / runs.METRICS_FILE).unlink(missing_ok=True)
     (metrics,) = run_jobs([run])
     draw_overview(run)
@@ -118,7 +120,7 @@ def track_command(options: Namespace) -> None:
 
 
 def _summary(metrics: dict[str, Any]) -> Iterator[str]:
-    """Lines that tell people how a run went."""
+    """Lines that tell the user how a run went: errors, lost frames, work."""
     n_frames, n_unknown = metrics["frames"], metrics["frames_without_reference"]
     ate, largest, still = (f"{1e3 * metrics.get(name, np.nan):.1f} mm" for name in _ERRORS)
     if "ate_rmse_m" in metrics:
@@ -140,7 +142,7 @@ def _summary(metrics: dict[str, Any]) -> Iterator[str]:
 
 
 def _warn(metrics: dict[str, Any]) -> None:
-    """Warn where a run's errors may not be trusted."""
+    """Print warnings if the errors of a run cannot be trusted."""
     outside = metrics.get("outside_map_share", 0.0)
     unseen = f"{outside:.0%} of the frames saw little of what was mapped" if outside > 0 else None
     for warning in filter(None, (metrics["map_warning"], unseen)):
@@ -148,10 +150,11 @@ def _warn(metrics: dict[str, Any]) -> None:
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:
-    """The named scene. Tells where it is likely read wrongly, as a room made here never is."""
+    """The scene that the command names; prints a line if its numbers are likely read wrongly."""
     scene = open_scene(options.sequence, preset, options.format)
-    if not scene.made and (found := quick_look(scene.recording)):
-        tell(f"nbtrack: {found}; `data check` tells more")
+    doubt = "" if scene.made else quick_look(scene.recording)  # rooms are always read rightly
+    if doubt:
+        tell(f"nbtrack: {doubt}; `data check` tells more")
     return scene
 
 
@@ -179,7 +182,10 @@ def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -
 
 
 def _make_map(job: MapJob) -> None:
-    """Print whether the map is cached, and make it if not, without the frames that lack a pose."""
+    """Make a map if it is not in the cache, and print whether it is.
+
+    Frames that have no pose are not mapped; a line says how many these are.
+    """
     folder = job.folder
     print(f"map found in {folder}" if job.is_done else f"no finished map in {folder}: mapping")
     has_pose = job.scene.recording.has_pose[reading.parse_frames(job.frames)]
@@ -189,7 +195,7 @@ def _make_map(job: MapJob) -> None:
 
 
 def make_command(options: Namespace) -> None:
-    """Write a synthetic room as a sequence folder."""
+    """Write a synthetic room as a sequence folder, and print what was written."""
     config = with_values(ScenesConfig(), {name: getattr(options, name) for name in SIZES})
     runs.check_no_recording(options.out)
     write_room(options.room, options.out, config)
@@ -197,9 +203,9 @@ def make_command(options: Namespace) -> None:
 
 
 def check_command(options: Namespace) -> int:
-    """Validate a recording; print what it holds and what is wrong, and draw it into --out.
+    """Check a recording; print what it holds and what is wrong, and draw it into --out.
 
-    Returns the exit status: 1 where it is wrong.
+    Returns the exit status: 1 if something is wrong, else 0.
     """
     runs.prepare(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
@@ -216,7 +222,7 @@ def check_command(options: Namespace) -> int:
 
 
 def convert_command(options: Namespace) -> None:
-    """Write a recording in the Neural RGB-D layout; print what became of it."""
+    """Write a recording in the Neural RGB-D layout, and print what was written."""
     frames = reading.parse_frames(options.frames)
     runs.check_no_recording(options.out)
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
@@ -224,6 +230,6 @@ def convert_command(options: Namespace) -> None:
 
 
 def fetch_command(options: Namespace) -> None:
-    """Bring a scene of the dataset into the data folder; print what was written."""
+    """Download a scene of the dataset into the data folder, and print what was written."""
     print(fetch_scene(options.scene, data_folder() / options.scene, options.url))
     print(f"  next: nbtrack track {options.scene} --method sdf --rate 5 --preset paper")

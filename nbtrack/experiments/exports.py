@@ -1,4 +1,4 @@
-"""What was tracked or mapped in other forms: pictures, movies, meshes, lists of poses."""
+"""Export runs and maps in other forms: pictures, movies, meshes, lists of poses."""
 
 import importlib.util
 from argparse import Namespace
@@ -25,13 +25,16 @@ from nbtrack.recordings.pose_files import number_lines, read_tum, shifted
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.tracking import Trajectory
 
-_FRAMES_SHOWN = 20  # of a longer run at least so many frames tell what an overview shows
-_CELLS = 120  # of an overview's mesh, along the longest side of its map
-_MOVIE_FRAMES = 100  # at most, evenly spread over a run
+_FRAMES_SHOWN = 20  # an overview shows what at least so many frames of a longer run saw
+_CELLS = 120  # of an overview's mesh, in two units of the map
+_MOVIE_FRAMES = 100  # at most so many, evenly spread over a run
 
 
 def draw_overview(run: TrackJob) -> None:
-    """Draw a finished run beside its files: the path in what was seen of the map, from above."""
+    """Draw a finished run into its folder: the camera's path in the part of the map that it saw.
+
+    Prints why if there is no picture.
+    """
     tracked = runs.read_trajectory(run.folder)
     field, metrics, n_frames = run.needs.map().field, tracked.metrics, len(tracked.frames)
     shown = np.arange(0, n_frames, max(1, n_frames // _FRAMES_SHOWN))
@@ -42,7 +45,7 @@ def draw_overview(run: TrackJob) -> None:
         return
     title = f"{run.scene.name}: {run.tracker} in {field.label}, {n_frames} frames"
     origin = np.array(metrics["origin"])
-    surface.apply_translation(origin)  # pictures are in the recording's world, as files are
+    surface.apply_translation(origin)  # pictures, as files, are in the recording's world
     paths = {}
     if "ate_rmse_m" in metrics:
         ate_m, still_m = metrics["ate_rmse_m"], metrics.get("still_ate_m", np.nan)
@@ -55,19 +58,23 @@ def draw_overview(run: TrackJob) -> None:
 
 
 def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSequence:
-    """What was observed in some rows of a run, from where its camera was estimated to be."""
+    """The frames of some rows of a run, as a sequence with the estimated poses."""
     frame_ids = tracked.frames["frame_id"].to_numpy()[rows]
     sequence = reading.read_frames(recording, frame_ids, needs_poses=False)
     return replace(sequence, T_world_camera=tracked.T_estimated[rows])
 
 
 def _surface(field: Any, seen: RgbdSequence, n_cells: int) -> Any:
-    """A mesh of what was seen of a map; `n_cells` span its longest side, or 6 m if that is less."""
+    """A mesh of the part of a map that some frames saw.
+
+    Two units of the map, or 6 m if that is more, have `n_cells` cells. Two units are the map's
+    longest side, unless its unit is declared.
+    """
     return extract_mesh(field, seen, voxel=max(6.0, 2 * field.bounds.metres_per_unit) / n_cells)
 
 
 def export_command(options: Namespace) -> None:
-    """Write a run or a map in another format, and print what was written."""
+    """Write a run or a map in the format that --to names, and print what was written."""
     export = look_up("format", options.to, _EXPORTS)
     runs.check_no_recording(options.out)
     if options.out.exists():
@@ -78,7 +85,11 @@ def export_command(options: Namespace) -> None:
 
 
 def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
-    """A map, or that of a run, as a coloured mesh: of what was seen, if that mesh is beside it."""
+    """The file of a coloured mesh of a map, or of the map of a run; and a summary.
+
+    The mesh is the one beside the map, which shows what was seen, if it is there; else it shows all
+    of the map.
+    """
     if (source / runs.METRICS_FILE).is_file():
         finished, source = _map_of(runs.read_trajectory(source))
     else:
@@ -98,7 +109,7 @@ def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
 
 
 def _map_of(tracked: Trajectory) -> tuple[Map, Path]:
-    """The map of a run, and where it lies. Raises DataError where that is another one by now."""
+    """The map of a run, and its path. Raises DataError if another map lies there by now."""
     path = Path(tracked.metrics["map"])
     stored = read_map(path)
     if tracked.metrics.get("map_key") != stored.key:
@@ -107,7 +118,10 @@ def _map_of(tracked: Trajectory) -> tuple[Map, Path]:
 
 
 def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
-    """A run as a movie or for Rerun. Its recording and map must lie where they did in tracking."""
+    """The file of a run as a movie or for Rerun; and a summary.
+
+    The recording and the map must lie where they lay when the run was made.
+    """
     if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
         raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
     tracked = runs.read_trajectory(source)
@@ -115,7 +129,7 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
     stored, _ = _map_of(tracked)
     shown = np.unique(np.linspace(0, n_frames - 1, _MOVIE_FRAMES).round().astype(int))
     seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
-    surface = _surface(stored.field, seen, 2 * _CELLS)  # cells half as large as in an overview
+    surface = _surface(stored.field, seen, 2 * _CELLS)  # with cells half as large as an overview's
     title = f"{metrics['scene']}: {metrics['tracker']} in {stored.field.label}"
     if format_name == "rrd":
         content = rerun_bytes(surface, seen, tracked, title)
@@ -130,8 +144,11 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
 
 
 def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
-    """The tracked poses of a run in KITTI's format, the only one of trajectories."""
-    n_poses = len(runs.read_trajectory(source).frames)  # raises for what is no run
+    """The tracked poses of a run in KITTI's format; and a summary.
+
+    `format_name` is not used: this is the only format of trajectories.
+    """
+    n_poses = len(runs.read_trajectory(source).frames)  # raises if the folder holds no run
     _, T_world_camera = read_tum(source / "trajectory.txt")  # m, in the recording's world
     summary = f"{n_poses} poses, without a first one that was given, as three rows of numbers (m)"
     return number_lines(T_world_camera[:, :3].reshape(-1, 12)), summary

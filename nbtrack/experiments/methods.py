@@ -41,6 +41,5 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
             raise ConfigError(f"no tracker works on field {field!r}: register one of your own")
         tracker = fits[0]
     if field is None:
-        fields = [row.field for row in METHODS.values() if row.tracker == tracker]
-        field = fields[0] if fields else "neus"
+        field = next((row.field for row in METHODS.values() if row.tracker == tracker), "neus")
     return find_methods([Method(f"{field_class(field).label} with {tracker}", field, tracker)])[0]

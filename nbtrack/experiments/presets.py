@@ -1,7 +1,8 @@
-"""Presets: everything that a run depends on, apart from the data and the seed.
+"""Presets: all settings of a run by one name, and how a user changes them.
 
-Precedence, in every command: class defaults < preset < method < TOML file (`NBTRACK_CONFIG` or
-`--config`) < `NBTRACK_SET` < `--set key=value`.
+A run depends on these settings, the data and the seed. In every command a later one of these wins
+over those before it: the defaults of the settings classes, the preset, the method, a TOML file
+(`NBTRACK_CONFIG` or `--config`), `NBTRACK_SET`, `--set key=value`.
 """
 
 import os
@@ -25,7 +26,7 @@ from nbtrack.tables import PAPER_PIXELS
 from nbtrack.tracking import TRACKERS, TrackerSettings
 
 Values = tuple[tuple[str, Any], ...]  # dotted keys and values
-Classes = tuple[tuple[str, type], ...]  # names and what is registered by them
+Classes = tuple[tuple[str, type], ...]  # names of fields or trackers and the classes they name
 
 
 @dataclass(frozen=True)
@@ -33,74 +34,79 @@ class ScenesConfig:
     """Which sequences a preset maps and tracks, and how synthetic rooms are made."""
 
     names: tuple[str, ...] = ()  # synthetic rooms, or folders below the data folder
-    motion: str = one_of(*MOTIONS)  # in a synthetic room: by default as the dataset's
-    n_frames: int = limited(300, 2, 10_000)
-    width: int = limited(640, 11, 4096)  # pixels; the height is three quarters of it
-    track_frames: str = ":"  # the Python slice of frames that is tracked
-    seed: int = limited(0, 0, 2**31 - 1)
-    labels: tuple[str, ...] = ()  # NAME=LABEL, as LaTeX tables name a scene
+    motion: str = one_of(*MOTIONS)  # of the camera in a synthetic room
+    n_frames: int = limited(300, 2, 10_000)  # of a synthetic room
+    width: int = limited(640, 11, 4096)  # of its images, in pixels; the height is three quarters
+    track_frames: str = ":"  # the Python slice of frames that are tracked
+    seed: int = limited(0, 0, 2**31 - 1)  # of the noise and the motion in a synthetic room
+    labels: tuple[str, ...] = ()  # NAME=LABEL: the names of scenes in LaTeX tables
 
 
 SIZES = ("motion", "n_frames", "width", "seed")
-"""What tells a synthetic room's recording from others of it."""
+"""The settings of a synthetic room on which its recording depends."""
 
 
 @dataclass(frozen=True)
 class TablesConfig:
-    """What the two tables ask of the cells."""
+    """The rates, budgets and numbers of pixels in the cells of Tables I and II."""
 
     rates_hz: tuple[float, ...] = limited((10.0, 5.0, 2.0), 0.01, 100.0)  # paper, Table I
     budgets_ms: tuple[float, ...] = limited((50.0, 100.0, 500.0), 0.1, 1e5)  # paper, Table II
-    # By tracker the n (pixels) of Table II (paper); trackers not named here take those of "sdf".
+    # The n (pixels) of Table II by tracker (paper). Trackers that are not named use those of "sdf".
     pixels: dict[str, tuple[int, ...]] = field(
         default_factory=lambda: {"vr": (128, 512, 1024), "sdf": (2048, 4096, 16384)}
     )
 
 
-# A density gains from finer detail; a distance must start smooth, or ripples satisfy the
-# eikonal term.
-# Fields without a `Network` class of their own, as NeuS+, have the network of NeuS.
+# Network settings of fields by name. A density gains from finer detail; a distance must start
+# smooth, or ripples satisfy the eikonal term. A field that is not named here and has no `Network`
+# class of its own, as NeuS+, uses the settings of NeuS.
 _NETWORKS = {
     "imap": NetworkSettings(embedding_sigma=4.0),
     "neus": NetworkSettings(),
     "occupancy": NetworkSettings(embedding_sigma=4.0),
 }
-# What a preset changes in these holds for all fields or trackers that it does not name.
+# For each part of the settings the field or tracker whose changes in a preset also hold for the
+# fields or trackers that the preset does not name.
 _MODELS = {"network": "neus", "mapping": "neus", "tracking": "sdf"}
 
 
 @dataclass(frozen=True)
 class Preset:
-    """Everything that a run depends on, apart from the data and the seed.
+    """All settings of a run: those of a named preset with the changes of a method and of the user.
 
-    It holds what a method and the user change in the preset of this name, as sorted pairs of a
-    dotted key and a value. All of that is checked.
+    Changes are sorted pairs of a dotted key and a value, which were checked.
     """
 
     name: str
-    of_method: Values = ()  # by the method that is run
-    chosen: Values = ()  # by the user, over the preset and the method
+    of_method: Values = ()  # changes by the method that is run
+    chosen: Values = ()  # changes by the user, which win over the method's
 
     @property
     def settings(self) -> dict[str, Any]:
-        """The whole tree, made once; and once more where a field or tracker is registered later."""
+        """All settings as a tree, for the fields and trackers that are registered now."""
         return _merged(self, tuple(FIELDS.items()), tuple(TRACKERS.items()))
 
     def with_values(self, values: Mapping[str, Any]) -> "Preset":
-        """The preset with a user's values, by dotted keys. Raises ConfigError for wrong ones."""
+        """The preset with values that a user chose, by dotted keys.
+
+        Raises ConfigError for an unknown key, or a value of the wrong type or range.
+        """
         tree = PRESETS[self.name].settings
         for key in values:
             part, *names = key.split(".")
             known = tree.get(part)
             if names and isinstance(known, dict):
-                # First the field or tracker: of whole keys the nearest may belong to another one.
+                # An unknown field or tracker gets its own message. The check of the whole key below
+                # could suggest a key of a field or tracker that is not meant.
                 look_up(f"config key, {part} of", names[0], known)
         checked = flat(with_values(tree, values))
         chosen = dict(self.chosen) | {key: checked[key] for key in values}
         return replace(self, chosen=tuple(sorted(chosen.items())))
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
-        """The preset with the `key=value` texts of a method, over which a user's values win."""
+        """The preset with the `key=value` texts of a method; values that a user chose stay."""
+        # Read as if a user had chosen them in the plain preset.
         of_method = dict(self.of_method) | dict(with_settings(PRESETS[self.name], *settings).chosen)
         return replace(self, of_method=tuple(sorted(of_method.items())))
 
@@ -111,12 +117,12 @@ class Preset:
 
     @property
     def tables(self) -> TablesConfig:
-        """What the tables ask."""
+        """The rates, budgets and numbers of pixels in the tables."""
         return self.settings["tables"]
 
     @property
     def correction(self) -> dict[str, float]:
-        """Cells (m) in which maps are corrected, by field; 0: they are not."""
+        """The size (m) of the cells in which maps are corrected, by field; 0: no correction."""
         return self.settings["correction"]
 
     def network_of(self, field_name: str) -> Any:
@@ -135,7 +141,7 @@ class Preset:
 
     @property
     def step_counts(self) -> str:
-        """For captions: with which sizes the paper measured its step counts, and what ours are."""
+        """A text for captions: the sizes for which the paper counted its steps, and those here."""
         paper = " and ".join(f"{n} ({tracker})" for tracker, n in PAPER_PIXELS.items())
         ours = " and ".join(f"{self.tracking_of(t.lower()).n_pixels} ({t})" for t in PAPER_PIXELS)
         width, our_width = NetworkSettings().width, self.network_of("neus").width
@@ -144,9 +150,9 @@ class Preset:
 
 
 _SMALL = flat(read_object(Path(__file__).with_name("smoke.toml")))
-# With the iterations of NeuS that the committed results of nine_rooms were made with.
+# The committed results of nine_rooms were made with this number of iterations of NeuS.
 _NINE = {"scenes.track_frames": ":", "mapping.neus.iterations": 1200}
-# What presets change in the defaults of the settings classes.
+# What each preset changes in the defaults of the settings classes, by dotted keys.
 _CHANGES: dict[str, dict[str, Any]] = {
     "smoke": _SMALL,
     "nine_rooms": _SMALL | {"scenes.names": REPORTED_ROOMS} | _NINE,
@@ -157,19 +163,19 @@ PRESETS = {name: Preset(name) for name in _CHANGES}
 
 
 def default_settings() -> dict[str, Any]:
-    """The tree of the settings classes' own defaults, for all fields and trackers known now."""
+    """The tree of the defaults of all settings classes, for the fields and trackers known now."""
     return _defaults(tuple(FIELDS.items()), tuple(TRACKERS.items()))
 
 
 @lru_cache(maxsize=1)
 def _defaults(fields: Classes, trackers: Classes) -> dict[str, Any]:
-    """The tree of defaults for some fields and trackers."""
+    """The tree of the defaults of all settings classes, for these fields and trackers."""
     learned = {name: kind for name, kind in fields if issubclass(kind, LearnedField)}
     networks = {n: k.Network() for n, k in learned.items() if k.Network is not NetworkSettings}
     return {
         "network": _NETWORKS | networks,
         "mapping": {name: kind.Settings() for name, kind in fields},
-        # Cells (m) in which the finished map of a distance is corrected; 0: it is not.
+        # Only maps of a distance can be corrected. The size of the cells (m); 0: no correction.
         "correction": {name: 0.0 for name, kind in learned.items() if kind.is_distance},
         "tracking": {name: kind.Settings() for name, kind in trackers},
         "scenes": ScenesConfig(),
@@ -179,10 +185,10 @@ def _defaults(fields: Classes, trackers: Classes) -> dict[str, Any]:
 
 @lru_cache(maxsize=64)
 def _merged(preset: Preset, fields: Classes, trackers: Classes) -> dict[str, Any]:
-    """The tree of a preset, for some fields and trackers.
+    """The tree of all settings of a preset, for these fields and trackers.
 
-    What the preset does not name has the defaults of its class, with what the preset changes in
-    NeuS or in SDF tracking. A user's values change only what they name.
+    Later changes win over earlier ones: those that the preset makes in fields and trackers that it
+    does not name, those in what it names, those of the method, those of the user.
     """
     tree, changes = _defaults(fields, trackers), _CHANGES[preset.name]
     of_unnamed = _changes_of_unnamed(changes, tree)
@@ -190,17 +196,19 @@ def _merged(preset: Preset, fields: Classes, trackers: Classes) -> dict[str, Any
 
 
 def _changes_of_unnamed(changes: dict[str, Any], tree: dict[str, Any]) -> dict[str, Any]:
-    """By dotted keys, what a preset changes in fields and trackers that it does not name.
+    """What a preset changes in fields and trackers that it does not name, by dotted keys.
 
-    That is what it changes in NeuS, or for trackers in SDF, where they have such a setting.
+    Such a field gets the changes that the preset makes in NeuS, and such a tracker the changes in
+    SDF tracking, for all settings that it has.
     """
-    named = {tuple(key.split(".")[:2]) for key in changes}
+    named = {tuple(key.split(".")[:2]) for key in changes}  # as ("mapping", "neus")
     values = {}
     for key, value in changes.items():
         part, name, *setting = key.split(".")
-        others = tree[part] if name == _MODELS.get(part) else {}
-        for other in others:
-            if (part, other) not in named and hasattr(others[other], setting[0]):
+        if name != _MODELS.get(part):
+            continue
+        for other, settings in tree[part].items():
+            if (part, other) not in named and hasattr(settings, setting[0]):
                 values[f"{part}.{other}.{setting[0]}"] = value
     return values
 
@@ -211,12 +219,13 @@ def load_preset(
     settings: Sequence[str] = (),
     of_method: Sequence[str] = (),
 ) -> Preset:
-    """A preset, by default that of `NBTRACK_PRESET`, else `smoke`, with all overrides applied.
+    """A preset with all changes by a method and by the user.
 
-    Each overrides those before it: the `key=value` texts `of_method`; a TOML file, by default the
-    one that `NBTRACK_CONFIG` names; the texts in `NBTRACK_SET`; `settings`. Raises ConfigError for
-    an unknown preset or key, or a value of the wrong type; MissingError if the file does not exist,
-    DataError if it is no TOML.
+    Its name is by default the one in `NBTRACK_PRESET`, else `smoke`. Of the changes, later ones win
+    over earlier ones: the `key=value` texts in `of_method`; a TOML file, by default the one that
+    `NBTRACK_CONFIG` names; the texts in `NBTRACK_SET`; the texts in `settings`. Raises ConfigError
+    for an unknown preset or key, or a value of the wrong type or range; MissingError if the file
+    does not exist; DataError if it is no TOML.
     """
     check_lists(settings=settings, of_method=of_method)
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
@@ -230,15 +239,15 @@ def load_preset(
         before = shlex.split(os.environ.get("NBTRACK_SET", ""))
     except ValueError as error:
         raise ConfigError(f"NBTRACK_SET cannot be split ({error}): quote as in a shell") from None
-    # The method comes last here, but what the user has chosen wins over it.
+    # What the user has chosen wins over the method, although the method is added last.
     return with_settings(preset, *before, *settings).with_method(of_method)
 
 
 def claim(preset: Preset, holds: bool, text: str, usual: Sequence[str] = ()) -> None:
-    """Print what a notebook claims of its results, or warn that it does not hold.
+    """Print a claim of a notebook about its results if it `holds`; else warn that it does not.
 
-    The claim was found with `smoke` and the notebook's `usual` texts, `key=value`: with just these
-    settings it must hold, and raises AssertionError if not.
+    The claim was found with the preset `smoke` and the notebook's `usual` texts `key=value`. With
+    exactly these settings, a claim that does not hold raises AssertionError.
     """
     if holds:
         print(text)

@@ -1,4 +1,4 @@
-"""How good a map is, against held-out images and the exact surface."""
+"""Scores of a map against held-out images, and against the exact surface of a synthetic room."""
 
 import numpy as np
 import torch
@@ -18,23 +18,23 @@ from nbtrack.synthetic import Room
 Scores = dict[str, float | None]
 SCORES = (
     "psnr_db",  # of held-out colour
-    "depth_l1_m",  # of held-out depth: the exact one of synthetic rooms, else the measured
-    "sdf_near_m",  # mean |error| where the true distance is below 5 cm
-    "sdf_free_m",  # mean |error| elsewhere in seen free space
+    "depth_l1_m",  # mean |error| of held-out depth, against exact depth in rooms, else measured
+    "sdf_near_m",  # mean |error| of the distance where the true distance is below 5 cm
+    "sdf_free_m",  # mean |error| of the distance elsewhere in free space that was seen
     "mesh_accuracy_m",  # mean distance of the mesh from the true surface
     "mesh_completion_m",  # mean distance of the true surface from the mesh
     "mesh_f_score",  # at 5 cm, in [0, 1]
 )
-NEAR = 0.05  # m: distances below this count as near a surface, and as found by the F-score
-POINTS_SCORED = 20_000  # on surfaces and along rays; as many pixels
+NEAR = 0.05  # m: closer points are near a surface; for the F-score they lie on it
+POINTS_SCORED = 20_000  # on the surface of a map, and on rays through as many pixels
 
 
 def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -> Scores:
-    """`SCORES` of a map of a sequence; None where a score cannot be told.
+    """The scores, named by `SCORES`, of a map of a sequence; None for those that it cannot have.
 
-    Images are scored only for learned fields and held-out frames, distances only for fields of a
-    distance, and distances and surfaces only in a synthetic `room`, whose geometry is known: there
-    they count where mapped frames saw them.
+    Images are scored if the field is learned and frames were held out. Distances are scored if the
+    field is a distance, and surfaces in any field, both only in a synthetic `room`, whose geometry
+    is known, and only where mapped frames saw the room.
     """
     field = finished.field
     scores = dict.fromkeys(SCORES)
@@ -43,7 +43,7 @@ def score_map(finished: Map, sequence: RgbdSequence, room: Room | None = None) -
         generator = torch.Generator(field.device).manual_seed(0)
         scores |= _score_images(field, _random_rays(sequence, held_out, generator), room)
     if room is not None:
-        generator = torch.Generator().manual_seed(0)  # on the CPU, as the room
+        generator = torch.Generator().manual_seed(0)  # on the CPU, as the room's geometry is
         rays = _random_rays(sequence, mapped, generator)
         if field.is_distance:
             scores |= _score_sdf(field, rays, generator, room)
@@ -58,17 +58,17 @@ def _random_rays(sequence: RgbdSequence, frames: Frames, generator: torch.Genera
 
 
 def _score_images(field: LearnedField, rays: Rays, room: Room | None) -> Scores:
-    """PSNR (dB) and depth L1 (m) over rays of held-out frames whose pixels are measured.
+    """PSNR (dB) of colour and L1 (m) of depth, over rays of held-out frames with a measured depth.
 
-    The depth is compared with the room's exact one, or with the measured one without a room.
+    Depth is compared with the exact depth in a room, without one with the measured depth.
     """
-    measured = rays.depth > 0
-    if not measured.any():
+    is_measured = rays.depth > 0
+    if not is_measured.any():
         return {}
-    origins, directions = rays.origins_world[measured], rays.directions_world[measured]
+    origins, directions = rays.origins_world[is_measured], rays.directions_world[is_measured]
     color, depth = field.render_rays(origins, directions)
-    psnr_db = -10 * float(np.log10((color - rays.color[measured]).square().mean().item()))
-    reference = (rays.depth if room is None else _exact_depths(rays, room))[measured]
+    psnr_db = -10 * float(np.log10((color - rays.color[is_measured]).square().mean().item()))
+    reference = (rays.depth if room is None else _exact_depths(rays, room))[is_measured]
     return {"psnr_db": psnr_db, "depth_l1_m": (depth - reference).cpu().abs().mean().item()}
 
 
@@ -80,14 +80,15 @@ def _exact_depths(rays: Rays, room: Room) -> Values:
 
 
 def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room) -> Scores:
-    """Mean |error| (m) of the signed distance near surfaces and in free space that was seen.
+    """Mean |error| (m) of the signed distance, near surfaces and in free space that was seen.
 
-    Points lie on rays of mapped frames: half between camera and surface, half near the surface.
+    It is taken over points on rays of mapped frames. Half of the points lie between the camera and
+    the measured surface, half within `NEAR` of the surface.
     """
     offsets = torch.rand(len(rays.depth), generator=generator, dtype=torch.float32)
     is_in_front = torch.arange(len(rays.depth)) % 2 == 0
-    around = rays.depth + NEAR * (2 * offsets - 1)
-    depths = torch.where(is_in_front, rays.depth * offsets, around)
+    near_surface = rays.depth + NEAR * (2 * offsets - 1)
+    depths = torch.where(is_in_front, rays.depth * offsets, near_surface)
     points_world = rays.points(depths[:, None])[rays.depth > 0, 0].double().numpy()
     true_sdf = room.sdf(points_world)
     _, sdf = query_field(field, points_world)
@@ -100,10 +101,11 @@ def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room)
 def _score_surface(
     field: Field, sequence: RgbdSequence, mapped: Frames, rays: Rays, room: Room
 ) -> Scores:
-    """Accuracy, completion (m) and F-score of the seen part of a map's surface, if it has one.
+    """Accuracy (m), completion (m) and F-score of the part of a map's surface that was seen.
 
-    The true surface is where `rays` of mapped frames meet the room, thinned to one point in a cell
-    of 5 cm: so what is near the camera, where rays are dense, counts no more than what is far.
+    Points of the true surface are those where `rays` of mapped frames meet the room, at most one in
+    each cell of 5 cm. So surfaces near the camera, where rays are dense, count no more than far
+    ones. Empty if the map has no surface.
     """
     try:
         mesh = extract_mesh(field, sequence, mapped)
@@ -114,9 +116,10 @@ def _score_surface(
     else:
         points = mesh.sample(POINTS_SCORED, seed=0)
     hits_world = rays.points(_exact_depths(rays, room)[:, None])[rays.depth > 0, 0].numpy()
-    _, one_a_cell = np.unique(np.floor(hits_world / NEAR).astype(int), axis=0, return_index=True)
-    to_truth = np.abs(room.sdf(points))
-    to_map, _ = cKDTree(points).query(hits_world[one_a_cell])
+    cells = np.floor(hits_world / NEAR).astype(int)
+    _, one_in_each_cell = np.unique(cells, axis=0, return_index=True)
+    to_truth = np.abs(room.sdf(points))  # m, from the map's surface
+    to_map, _ = cKDTree(points).query(hits_world[one_in_each_cell])  # m, from the true surface
     precision, recall = float((to_truth < NEAR).mean()), float((to_map < NEAR).mean())
     return {
         "mesh_accuracy_m": float(to_truth.mean()),

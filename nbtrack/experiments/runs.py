@@ -1,6 +1,6 @@
 """Results on disk: where commands may write, the files of finished runs, and means over rooms.
 
-Nothing is written into a recording, and nothing over files that nbtrack did not write.
+nbtrack writes nothing into a recording, and overwrites only files that it has written itself.
 """
 
 import io
@@ -24,27 +24,28 @@ from nbtrack.recordings.pose_files import read_tum, shifted, tum_text
 from nbtrack.tracking.metrics import trajectory_metrics
 from nbtrack.tracking.trajectories import Trajectory
 
-METRICS_FILE = "metrics.json"  # written last: where it stands, a run is complete
+METRICS_FILE = "metrics.json"  # written last: a run is complete if this file is there
 OVERVIEW_FILE = "overview.png"
 CHECK_FILE = "check.png"
 MARK = ".nbtrack"
-"""An empty file in every folder given with --out, where nbtrack may replace its results."""
-# The last one of each tells that the others are there.
+"""An empty file in every folder that was given with --out: nbtrack may replace its results there.
+"""
+# The last file of each is written last, as the sign that the others are there.
 FILES_OF_RUN = ("trajectory.txt", "groundtruth.txt", "frames.csv", OVERVIEW_FILE, METRICS_FILE)
 FILES_OF_MAP = (HISTORY_FILE, MESH_FILE, MAP_FILE)
 _RESULTS = (*FILES_OF_RUN, *FILES_OF_MAP, CHECK_FILE, "table_[123]*")
 
 
 def is_own_output(folder: Path) -> bool:
-    """Whether nbtrack has written results into a folder."""
+    """Whether a folder is marked as one into which nbtrack writes results."""
     return (folder / MARK).exists()
 
 
 def prepare(folder: Path | None) -> None:
-    """Mark a folder, before the work, as one for nbtrack's results. For None nothing is done.
+    """Mark a folder as one for nbtrack's results, before any work. None means no folder.
 
-    Raises ConfigError where it holds a recording, or files of somebody else that are named like
-    results; OSError where nothing can be written.
+    Raises ConfigError if the folder holds a recording, or if it is not marked yet and holds files
+    with the names of results; OSError if nothing can be written.
     """
     if folder is None:
         return
@@ -56,10 +57,11 @@ def prepare(folder: Path | None) -> None:
 
 
 def deliver(cached: Path, names: Sequence[str], folder: Path | None) -> Path:
-    """Copy a result's files from the cache to a folder, if one is given.
+    """Copy the files of a result from the cache to a folder, if one is given.
 
-    Returns the folder where the result then is. A file that an earlier result left there, and that
-    this one lacks, is removed. The last of `names` is written last, as the sign that all are there.
+    Returns the folder that then holds the result. A file that this result lacks is removed: an
+    earlier result may have left it there. The last of `names` is written last, as the sign that all
+    are there.
     """
     if folder is None:
         return cached
@@ -72,14 +74,14 @@ def deliver(cached: Path, names: Sequence[str], folder: Path | None) -> Path:
 
 
 def check_no_recording(path: Path) -> None:
-    """Raises ConfigError if a path that is to be written is a recording, or lies within one."""
+    """Raises ConfigError if a path to be written is a recording's folder or lies within one."""
     for folder in (path, *files.resolved(path).parents):
         if folder.is_dir() and holds_recording(folder):
             raise ConfigError(f"{folder} holds a recording, where nothing is written: take another")
 
 
 def save_picture(figure: Figure, path: Path, dpi: float | str = "figure") -> None:
-    """Writes a figure as a PNG, by default with the dots per inch of the figure itself."""
+    """Writes a figure as a PNG file; `dpi` are dots per inch, by default those of the figure."""
     content = io.BytesIO()
     with in_house_style():
         figure.savefig(content, dpi=dpi)
@@ -89,10 +91,10 @@ def save_picture(figure: Figure, path: Path, dpi: float | str = "figure") -> Non
 def write_run(folder: Path, run: Trajectory) -> None:
     """Writes the files of a finished run.
 
-    Its poses are relative to the origin that its metrics name, those in the files are in the world
-    of the recording. `trajectory.txt` and `groundtruth.txt` (TUM) hold the tracked frames, without
-    a first one whose pose was given: so public tools report the error of the paper's formula. Where
-    no true pose is known there is no `groundtruth.txt`.
+    Poses of `run` are relative to the origin in its metrics; poses in the files are in the world of
+    the recording. `trajectory.txt` and `groundtruth.txt` are in TUM format. They leave out a first
+    frame whose pose was given, so that public tools report the error of the paper's formula. If no
+    true pose is known, there is no `groundtruth.txt`.
     """
     times, origin = run.frames["time"].to_numpy(), np.array(run.metrics["origin"])
     texts = {
@@ -107,9 +109,9 @@ def write_run(folder: Path, run: Trajectory) -> None:
 
 
 def read_trajectory(folder: Path) -> Trajectory:
-    """A finished run from its folder, its poses relative to the map's origin, as in tracking.
+    """Read a finished run from its folder; its poses are relative to the map's origin.
 
-    Raises MissingError if there is none.
+    Raises MissingError if there is none, and DataError if its files are damaged.
     """
     if not (folder / METRICS_FILE).is_file():
         raise MissingError(f"no finished run in {folder}: give a folder that `track` wrote")
@@ -118,25 +120,26 @@ def read_trajectory(folder: Path) -> Trajectory:
     truth = folder / "groundtruth.txt"
     if truth.is_file():
         times_known, T_known = read_tum(truth)
-        T_true[np.searchsorted(times, times_known)] = T_known  # in the rows of the same times
+        T_true[np.searchsorted(times, times_known)] = T_known  # rows of the same times
     metrics = read_object(folder / METRICS_FILE)
     with files.naming_damaged(folder / "frames.csv", "table of frames", "track again"):
         frames = pd.read_csv(folder / "frames.csv")
         if len(frames) != len(T_estimated):
             raise ValueError(f"{len(frames)} rows for {len(T_estimated)} poses")
-    back = -np.array(metrics.get("origin", [0, 0, 0]))
-    return Trajectory(shifted(T_estimated, back), shifted(T_true, back), frames, metrics)
+    to_origin = -np.array(metrics.get("origin", [0, 0, 0]))
+    return Trajectory(shifted(T_estimated, to_origin), shifted(T_true, to_origin), frames, metrics)
 
 
 def scores_of(tracked: Trajectory) -> dict[str, Any]:
-    """Errors of a run, how well the tracker's own verdicts tell them, and its speed.
+    """The errors of a run, its speed, and how well the tracker told which frames were lost.
 
-    Verdicts, the column `lost`, are compared in frames with a true pose only.
+    What the tracker told is the column `lost`, which not all trackers have. It is compared with the
+    errors in frames with a true pose.
     """
     rows = tracked.frames
     metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
     if "lost" in rows:
-        rated = rows.dropna(subset="translation_error_m")
+        rated = rows.dropna(subset="translation_error_m")  # the frames with a true pose
         errors_m = rated["translation_error_m"].to_numpy()
         metrics["flagged_frames"] = int(rated["lost"].sum())
         metrics |= score_detection(rated["lost"].to_numpy(dtype=bool), errors_m)
@@ -152,27 +155,33 @@ def scores_of(tracked: Trajectory) -> dict[str, Any]:
 
 
 def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd.DataFrame:
-    """Geometric mean of a positive column by groups, and its 95 % interval: columns `from`, `to`.
+    """Geometric mean over rooms of a positive column, for groups of rows, and its 95 % interval.
 
-    A room counts once, with the mean of its seeds' logarithms: rooms differ more than seeds do.
-    The interval is Student's, of the means of the rooms' logarithms, and NaN for a single room (our
-    choice).
+    `results` has a row for each run, with a column `scene`; rows with equal values in the columns
+    `by` are a group. Returns a row for each group with the columns `by`, `value`, `from` and `to`.
+
+    Each room counts once, by the mean over its seeds, since rooms differ more than seeds do. Means
+    and the interval, Student's over rooms, are of logarithms (our choice). The interval is NaN for
+    a single room.
     """
     logarithms = np.log(results.set_index([*by, "scene"])[value])
     of_rooms = logarithms.groupby([*by, "scene"], sort=False).mean()
     groups = of_rooms.groupby(by, sort=False)
-    mean, half = groups.mean(), groups.sem() * stdtrit(groups.size() - 1, 0.975)
+    mean, half = groups.mean(), groups.sem() * stdtrit(groups.size() - 1, 0.975)  # half the width
     return np.exp(pd.DataFrame({value: mean, "from": mean - half, "to": mean + half})).reset_index()
 
 
 def shares(results: pd.DataFrame, by: list[str], value: str) -> pd.DataFrame:
-    """Share (%) of rows whose value is true, by groups, and its 95 % interval: `from`, `to` (%).
+    """Share (%) of rows in which the column `value` is true, for groups of rows.
 
-    The interval is Wilson's (1927), as if rows were independent. Columns `true` and `size` count.
+    Rows with equal values in the columns `by` are a group. Returns a row for each group with the
+    columns `by`, `value` (the share), `from` and `to` (its 95 % interval, in %), `true` (the number
+    of such rows) and `size` (the number of all). The interval is Wilson's (1927), as if rows were
+    independent.
     """
     groups = results.groupby(by, sort=False, observed=True)[value]
     true, size, z = groups.sum(), groups.size(), ndtri(0.975)
     middle = (true + z**2 / 2) / (size + z**2)
-    half = z / (size + z**2) * np.sqrt(true * (size - true) / size + z**2 / 4)
-    columns = {value: true / size, "from": middle - half, "to": middle + half}
+    half_width = z / (size + z**2) * np.sqrt(true * (size - true) / size + z**2 / 4)
+    columns = {value: true / size, "from": middle - half_width, "to": middle + half_width}
     return (100 * pd.DataFrame(columns).clip(0, 1)).assign(true=true, size=size).reset_index()

@@ -1,4 +1,4 @@
-"""Runs as jobs: a camera tracked in a map, its errors, and where they come from."""
+"""Runs as jobs. In a run a camera is tracked in a map; errors and their provenance are stored."""
 
 import contextlib
 import shlex
@@ -38,31 +38,35 @@ _OTHER_WORLD = (
     "the recording's poses are in another world than the map: they were moved into it by the one "
     "rigid motion that explains the difference, and errors are those that remain"
 )
-# A user is warned of larger ones. Hands start and stop, and a search catches up (our choice).
-_GREEDY_ATE = 0.01  # m, the ATE of a greedy search with the run's reach
-_SHARE = 0.5  # of the frames: those in which the camera moves farther than a search reaches
+# A user is warned before a run if one of these numbers is larger (our choice). Smaller ones do no
+# harm: a hand starts and stops, and the search catches up.
+_GREEDY_ATE = 0.01  # m, the ATE of a greedy search that moves no farther than the run's tracker
+_SHARE = 0.5  # the share of frames in which the camera moves farther than the search reaches
 
 
 @dataclass(frozen=True)
 class TrackJob(Job):
-    """One tracked run in a map, under one budget: `steps` a frame, or by the clock `rate_hz`."""
+    """One tracked run in a map, with a number of steps for each frame, or a rate by the clock."""
 
     needs: MapJob
-    scene: Scene  # the mapped one, or another recording of the same room
+    scene: Scene  # the one that was mapped, or another recording of the same room
     tracker: str
     settings: TrackerSettings
-    steps: float | int | None = None
-    rate_hz: float | int | None = None
-    frames: str = ":"
+    steps: float | int | None = None  # for each frame; None by the clock
+    rate_hz: float | int | None = None  # by the clock a frame gets 1/rate seconds; None by steps
+    frames: str = ":"  # the slice of the scene's frames that are tracked
     seed: int = 0
-    start: str = "given"  # the first frame's true pose, where known; or "unknown"
+    start: str = "given"  # at the first frame's true pose, if it is known; or "unknown"
 
     kind, doing = "tracks", "tracking"
 
     @cached_property
     def key(self) -> str:
-        """A digest of code, map, tracker, budget, frames, seed; by the clock, machine, threads."""
-        # Of the tracker's class; the map's key has that of the field's.
+        """A digest of code, map, tracker, budget, frames and seed.
+
+        By the clock the result also depends on the device and the number of threads.
+        """
+        # Of the tracker's class. The map's key holds the code of the field's class.
         code = provenance.code_fingerprint(tracker_class(self.tracker))
         clock = self.rate_hz, device_name(choose_device()), torch.get_num_threads()
         budget = self.steps if self.rate_hz is None else clock
@@ -72,7 +76,7 @@ class TrackJob(Job):
 
     @property
     def name(self) -> str:
-        """Scene, method and budget, and the seed if it is not the first."""
+        """The scene, the method and the budget, and the seed if it is not 0."""
         budget = f"{self.rate_hz:g}hz" if self.rate_hz else f"{self.steps:g}steps"
         elsewhere = "-unmapped" if self.is_elsewhere else ""
         name = f"{self.scene.name}-{self.needs.field}-{self.tracker}{elsewhere}-{budget}"
@@ -80,7 +84,7 @@ class TrackJob(Job):
 
     @property
     def is_elsewhere(self) -> bool:
-        """Whether the map was made from another recording."""
+        """Whether the map was made from another recording than the one that is tracked."""
         return self.needs.given is not None or self.needs.scene.folder != self.scene.folder
 
     @property
@@ -89,24 +93,24 @@ class TrackJob(Job):
         return (self.folder / METRICS_FILE).is_file()
 
     def _true_path(self) -> Poses:
-        """True poses of the frames (m), NaN where not known. Raises as `select_frames` does."""
+        """True poses (m) of the tracked frames, NaN if unknown. Raises as `select_frames` does."""
         return self.scene.recording.T_world_camera[self.scene.select(self.frames, False)]
 
     def check(self) -> None:
-        """Raises ConfigError or DataError, before anything is made, where a run cannot begin."""
+        """Raises ConfigError or DataError, before anything is made, if the run cannot begin."""
         T_first = self._true_path()[0]
-        # The result is not used, and any pose will do: this raises for an unknown motion model.
+        # This raises an error for an unknown motion model; the pose does not matter.
         expected_poses(self.settings.motion_model, [np.eye(4)])
-        if not self._starts_at(T_first):  # then the tracker has to find the camera in the map
+        if not self._starts_at(T_first):  # the tracker then has to find the camera in the map
             tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction_voxel > 0)
 
     def expected_reach(self) -> dict[str, float]:
-        """What `reach_metrics` will give for the run.
+        """The `reach_metrics` of the run, before it is made.
 
-        It is empty for a run by the clock, whose number of steps is not known in advance.
+        They are empty for a run by the clock, whose number of steps is not known in advance.
         """
         if self.steps is not None:
-            with contextlib.suppress(NbtrackError):  # the run itself will raise it
+            with contextlib.suppress(NbtrackError):  # the run will raise the error, too
                 reach = self.settings.reach(self.steps, map_unit(self.needs))
                 return reach_metrics(reach, self._true_path(), self.settings.motion_model)
         return {}
@@ -120,9 +124,10 @@ class TrackJob(Job):
         return metrics
 
     def compute(self, report: Report) -> dict[str, Any]:
-        """Track, or take a killed run up where its last checkpoint stands; write the files.
+        """Track, or go on from the last checkpoint of a killed run; write the files.
 
-        Raises DataError where a given map does not fit the first frame at its given pose.
+        Returns the metrics. Raises DataError if a given map does not fit the first frame at its
+        given pose.
         """
         finished = self.needs.map()
         origin = np.array(finished.record["origin"])
@@ -135,13 +140,13 @@ class TrackJob(Job):
 
         T_first = sequence.T_world_camera[0]
         is_start_known = self._starts_at(T_first)
-        T_start = T_first if is_start_known else np.eye(4)
+        T_start = T_first if is_start_known else np.eye(4)  # a placeholder: the camera is found
         field, budget = finished.field, make_budget(self.steps, self.rate_hz)
         tracker = make_tracker(self.tracker, field, T_start, budget, self.settings, self.seed)
         checkpoint = self.folder / RUN_FILE
         tracked = track_sequence(tracker, sequence, checkpoint, report_frame, is_start_known)
         notes = self._notes(finished, sequence, tracked, warning)
-        notes["device"] = device_name(tracker.device)  # LM and ICP run on the host
+        notes["device"] = device_name(tracker.device)  # the CPU for LM and ICP
         if warning == _OTHER_WORLD:
             tracked, is_explained = in_world_of_map(tracked)
             notes["map_warning"] = warning if is_explained else None
@@ -151,17 +156,18 @@ class TrackJob(Job):
         return metrics
 
     def _starts_at(self, T_first: Pose) -> bool:
-        """Whether the run starts at the first frame's pose, else the camera is found first."""
+        """Whether the run starts at the first frame's pose; if not, the camera is found first."""
         return self.start == "given" and bool(np.isfinite(T_first).all())
 
     def _map_warning(self, finished: Map, first: Frame) -> str | None:
-        """A warning about how a given map fits the first frame; None where it fits.
+        """A warning if a given map may not fit the first frame of the recording; None if it fits.
 
-        Without depth the fit cannot be checked, which is a warning. A map that does not fit at the
-        recording's pose is a DataError where the run starts at that pose, else `_OTHER_WORLD`.
+        If the frame has no depth, the warning says that the fit cannot be checked. If the map does
+        not fit at the recording's pose, it is `_OTHER_WORLD`; a run that starts at that pose raises
+        DataError instead.
         """
-        # Only given maps are checked: one made here is of the right room, but another path in the
-        # room may begin where it does not reach.
+        # A map that was made here is not checked. It is of the right room, and a path in the room
+        # may begin where the map does not reach.
         if not self.needs.given or first.T_world_camera is None:
             return None
         try:
@@ -174,15 +180,19 @@ class TrackJob(Job):
     def _notes(
         self, finished: Map, sequence: RgbdSequence, tracked: Trajectory, warning: str | None
     ) -> dict[str, Any]:
-        """Metrics of a run beside its errors; `warning` is what `_map_warning` returned."""
+        """Metrics of a run that are neither errors nor speed.
+
+        `warning` is what `_map_warning` returned.
+        """
         T_true, T_estimated = sequence.T_world_camera, tracked.T_estimated
         unit_m = finished.field.bounds.metres_per_unit
-        n_given = len(sequence) - len(tracked.frames)  # a first frame whose pose is given: 1, or 0
+        # 1 if the first frame's pose was given, so that the frame was not tracked; else 0.
+        n_given = len(sequence) - len(tracked.frames)
         notes = {"metres_per_unit": unit_m, "map_warning": warning}
         notes["start"] = "given" if n_given else "unknown"
         if self.needs.given:
             followed = sequence.select(slice(n_given, None))
-            if warning == _OTHER_WORLD:
+            if warning == _OTHER_WORLD:  # only the estimated poses are in the map's world
                 followed = replace(followed, T_world_camera=T_estimated)
             notes["outside_map_share"] = outside_map_share(finished.field, followed, T_estimated)
         reach = self.settings.reach(tracked.frames["steps"].mean(), unit_m)
@@ -190,7 +200,7 @@ class TrackJob(Job):
         return notes | still_metrics(T_true) | reached
 
     def _provenance(self, finished: Map) -> dict[str, Any]:
-        """Where a run comes from: data, map, method, settings, machine; how to make it again."""
+        """The data, map, method, settings and machine of a run, and the command that repeats it."""
         return {
             "threads": torch.get_num_threads(),
             "scene": self.scene.name,
@@ -212,14 +222,15 @@ class TrackJob(Job):
         }
 
     def _command(self) -> str:
-        """The command that repeats this run, and makes its map where that is not cached.
+        """The command that repeats this run, and makes its map if it is not cached.
 
-        It names a synthetic room, which is made again, and the folder of another recording.
+        The command names a room in the cache by the room's name, so that it is made again, and any
+        other recording by its folder.
         """
         options = {"tracker": self.tracker, "rate": self.rate_hz, "steps": self.steps}
         options |= {"start": self.start, "frames": self.frames, "seed": self.seed}
-        # The preset `synthetic` has the defaults that `changed_settings` compares with.
         options |= {"format": self.scene.format, "device": choose_device().type}
+        # This preset has the default settings, with which `changed_settings` compares below.
         options["preset"] = "synthetic"
         settings: dict[str, Any] = {"tracking": {self.tracker: self.settings}}
         sequence = str(self.scene.folder)
@@ -240,17 +251,17 @@ class TrackJob(Job):
 
 
 def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
-    """A line for each kind of run whose search falls behind its camera, whatever the map is.
+    """Warnings of runs whose search cannot follow the camera, however good the map is.
 
-    A kind is a tracker with its settings and steps. The line is about the run in which a greedy
-    search with this reach has the largest ATE.
+    Runs with the same tracker, settings and steps share one line. It is about the run in which a
+    greedy search of the same reach has the largest ATE.
     """
     pairs = [(run, run.expected_reach()) for run in runs]
-    pairs = [pair for pair in pairs if "greedy_ate_m" in pair[1]]  # true paths are known
+    pairs = [pair for pair in pairs if "greedy_ate_m" in pair[1]]  # needs a known true path
     pairs.sort(key=lambda pair: pair[1]["greedy_ate_m"])
-    # The last one of a kind, which has the largest ATE, replaces those before it.
-    largest = {(run.tracker, run.settings, run.steps): (run, reach) for run, reach in pairs}
-    for run, reach in largest.values():
+    # In the order of ATE, so that of equal keys the run with the largest ATE stays.
+    worst = {(run.tracker, run.settings, run.steps): (run, reach) for run, reach in pairs}
+    for run, reach in worst.values():
         if reach["greedy_ate_m"] <= _GREEDY_ATE and reach["beyond_reach_share"] <= _SHARE:
             continue
         advice = "take more steps, a lower rate, "

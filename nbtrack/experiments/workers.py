@@ -1,4 +1,4 @@
-"""Where jobs run side by side: processes of this machine, or the workers of a Dask cluster."""
+"""Workplaces, where jobs run side by side: processes of this machine, or a Dask cluster."""
 
 import contextlib
 import multiprocessing
@@ -19,59 +19,64 @@ from nbtrack.machinery.errors import MissingError
 _START = "spawn"  # how worker processes begin: forked ones would lack the threads of libraries
 _SECONDS_TO_CONNECT = 10
 DEATHS = ("BrokenProcessPool", "KilledWorker")
-"""Names of the errors that are raised, here or by Dask, where the process of a call has died."""
+"""Names of the errors that tell that the process of a call has died: Python's and Dask's."""
 
 
 class Workplace(NamedTuple):
-    """Executors for one call at a time; one whose process died is not used again."""
+    """Executors of calls, each for one call at a time.
 
-    begin: Callable[[], Executor]
-    n_calls: int  # at a time
-    n_threads: int  # of each call
-    idle: list[Executor]  # those begun that have no call
+    An executor whose process has died must not be put back into `idle`.
+    """
+
+    begin: Callable[[], Executor]  # starts one more executor
+    n_calls: int  # how many calls may run at a time
+    n_threads: int  # how many CPU threads each call may use
+    idle: list[Executor]  # executors that run no call now
 
 
 @contextlib.contextmanager
 def processes(number: int) -> Iterator[Workplace]:
-    """Processes of this machine, which end with the block, or with this process if it is killed.
+    """A workplace of several processes of this machine, among which its threads are shared.
 
-    They share the threads of this one. Each watches a pipe whose other end, `ours`, is closed in
-    both cases. At the block's end that comes first, so that nothing waits for jobs that still run.
+    The processes end at once when the block ends, and when this process is killed. For this each of
+    them watches a pipe, whose other end, `ours`, is closed in both cases. It is closed before the
+    executors, which would otherwise wait for calls that still run.
     """
     context = multiprocessing.get_context(_START)
     theirs, ours = context.Pipe(duplex=False)
     with contextlib.ExitStack() as stack, ours:
 
         def begin() -> Executor:
-            # One process each: where several share an executor, one that dies ends them all.
+            # An executor with several processes would end all of them when one dies.
             executor = ProcessPoolExecutor(1, context, _end_with, (theirs,))
             stack.enter_context(executor)
             with _spared():
-                executor.submit(int)  # a call that does nothing: the process is begun for it
+                executor.submit(int)  # starts the process, within `_spared`; the call does nothing
             return executor
 
         yield Workplace(begin, number, max(1, torch.get_num_threads() // number), [])
 
 
 def _end_with(pipe: Connection) -> None:
-    """End this worker, whatever it does, as soon as the other end of a pipe is closed."""
+    """End this worker process, whatever it does, when the other end of the pipe is closed."""
 
     def watch() -> None:
-        pipe.poll(None)  # waits without limit: nothing is ever sent
-        os._exit(1)  # at once, in the middle of a job
+        pipe.poll(None)  # waits for the end of the pipe, since nothing is ever sent
+        os._exit(1)  # ends the process at once, also in the middle of a job
 
     threading.Thread(target=watch, daemon=True).start()
 
 
 @contextlib.contextmanager
 def _spared() -> Iterator[None]:
-    """Let processes that are started in a block ignore Ctrl-C, and not run the main script again.
+    """Run a block whose new processes ignore Ctrl-C and do not run the main script again.
 
-    At Ctrl-C each would print a traceback. A main script without a `__main__` guard would start
-    processes from within them: Python runs again what `sys.modules` holds as `__main__`.
+    At Ctrl-C each of them would print a traceback. In each new process Python runs the module again
+    that is `__main__` here. A main script without a `__main__` guard would then start more
+    processes from there, so an empty module takes its place during the block.
     """
     script = sys.modules["__main__"]
-    # Python lets only the main thread set a handler.
+    # Only the main thread may set a handler of signals.
     is_main = threading.current_thread() is threading.main_thread()
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
     sys.modules["__main__"] = ModuleType("__main__")
@@ -85,9 +90,9 @@ def _spared() -> Iterator[None]:
 
 @contextlib.contextmanager
 def cluster(address: str, n_calls: int) -> Iterator[Workplace]:
-    """The workers of a Dask scheduler, among which it shares so many calls at a time.
+    """A workplace of the workers of a Dask scheduler, which gets `n_calls` calls at a time.
 
-    Raises MissingError where there are none.
+    Raises MissingError if there is no scheduler at the address, or if it has no worker.
     """
     from distributed import Client  # an extra
 
@@ -98,9 +103,9 @@ def cluster(address: str, n_calls: int) -> Iterator[Workplace]:
         advice = "start 'dask scheduler', and 'dask worker ADDRESS --nthreads 1'"
         raise MissingError(f"no Dask scheduler at {address!r} with a worker: {advice}") from None
     with client:
-        # Not pure: Dask would answer an equal call with the result of the earlier one.
+        # With `pure` Dask would answer an equal call with the result of an earlier one.
         executor = client.get_executor(pure=False)
         try:
             yield Workplace(lambda: executor, n_calls, 1, [])
         finally:
-            executor.shutdown(wait=False)  # after an error nothing waits for jobs that still run
+            executor.shutdown(wait=False)  # after an error: does not wait for jobs that still run
