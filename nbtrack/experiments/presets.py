@@ -106,7 +106,7 @@ class Preset:
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
         """The preset with the `key=value` texts of a method; values that a user chose stay."""
-        # Read as if a user had chosen them in the plain preset.
+        # The plain preset checks the texts; its chosen values are then those of the method.
         of_method = dict(self.of_method) | dict(with_settings(PRESETS[self.name], *settings).chosen)
         return replace(self, of_method=tuple(sorted(of_method.items())))
 
