@@ -94,6 +94,7 @@ OPTIONS = {
     "--set": _option("one setting, as mapping.neus.iterations=500; may be repeated", **_SETTINGS),
     "--import": _option("your file or module of fields, trackers, methods first", **_IMPORTS),
 }
+# Options that several commands have, as words for `COMMANDS`.
 _RUN = " --out --device --config --set"
 _MADE = " --method --field --format --frames --seed --preset" + _RUN
 _PARTS = " --format --depth-folder --poses"

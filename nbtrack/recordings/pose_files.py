@@ -115,7 +115,8 @@ def check_order(files: list[Path]) -> None:
     # Decimals must be equally many, unless all names are times: 1.5 may be 1.50, which comes after
     # 1.25, or chapter 1.5, which comes before chapter 1.25.
     decimals = {tuple(map(len, re.findall(r"\d\.(\d+)", path.stem))) for path in files}
-    if len(kinds) > 1 or (None in stamps and (any(stamps) or len(decimals) > 1)):
+    is_mixed = any(stamps) or len(decimals) > 1
+    if len(kinds) > 1 or (None in stamps and is_mixed):
         found = f"{names} differ in more than their numbers, or in how these are written"
         raise DataError(f"{found}, which tells no order: number the images as they were recorded")
     # All names now have equally many numbers: a column for each place of a number in the names.
@@ -128,7 +129,8 @@ def check_order(files: list[Path]) -> None:
         # If a counter went back to 0 at `end`, its sorted numbers have a wide gap, and from the
         # last number it is a usual step over `end` to the first one.
         for end in (10 ** len(str(last)), 2**8, 2**16, 2**32):
-            if 0 < numbers[0] + end - last <= 2 * usual and steps.max() > 10 * usual:
+            step_over_end = numbers[0] + end - last
+            if 0 < step_over_end <= 2 * usual and steps.max() > 10 * usual:
                 i = steps.argmax()
                 found = f"{names} have the numbers {numbers[0]} to {numbers[i]} and "
                 found += f"{numbers[i + 1]} to {last}: a counter that went back to 0 at {end}?"
