@@ -115,6 +115,7 @@ def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: boo
     check_lists(at_least=1, rates_hz=rates)
     if steps is not None and (rates_hz is not None or clock):
         raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: leave one out")
+    # `tolist` turns numbers of numpy into Python's, and leaves None as it is.
     return np.asarray(rates).tolist() if steps is None else [None], np.asarray(steps).tolist()
 
 

@@ -57,7 +57,10 @@ def check_lists(at_least: int = 0, **arguments: object) -> None:
 
 
 def check_kind(kind: Any, **arguments: object) -> None:
-    """Raises ConfigError for an argument of another class than `kind`, or than all of a union."""
+    """Raises ConfigError for an argument that is not of the class `kind`.
+
+    `kind` may be a union of classes. The keyword of each argument is its name in the message.
+    """
     for name, value in arguments.items():
         if not isinstance(value, kind):
             wanted = getattr(kind, "__name__", kind)

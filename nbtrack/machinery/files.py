@@ -46,8 +46,8 @@ def absolute(path: Path | str) -> Path:
     """An absolute path without `~` and `..`.
 
     Links are not followed, so that a recording that is given by a link has the name of the link.
-    Raises MissingError for `~` with a name that no user has, ConfigError for what is no path, and
-    for an empty text, which would mean the working folder.
+    Raises MissingError for `~` with a name that no user has. Raises ConfigError for an argument of
+    another type, and for an empty text, which would mean the working folder.
     """
     if not isinstance(path, Path | str) or path == "":
         raise ConfigError(f"{path!r:.80} is no path: give one, or . for the working folder")

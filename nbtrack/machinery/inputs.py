@@ -42,10 +42,10 @@ _DECIMAL_COMMA = re.compile(r"(?<!\S)[-+]?\d+,\d+(e[-+]?\d+)?(?!\S)")
 def check_array(
     what: str, array: Any, shape: tuple, kinds: list, asked: str, of: type = np.ndarray
 ) -> None:
-    """Raises DataError unless `array` is of this class, this shape and one of these types.
+    """Raises DataError unless `array` is of the class `of` and has this shape and an allowed type.
 
-    `kinds` are the types as jaxtyping has them, as `UInt8`. The message calls the array `what`, and
-    describes its allowed types by the words in `asked`.
+    `kinds` are the allowed types as jaxtyping has them, as `UInt8`. The message calls the array
+    `what`, and describes its allowed types by the words in `asked`.
     """
     if not any(isinstance(array, _type_of(kind, of, shape)) for kind in kinds):
         is_of = isinstance(array, of)
@@ -62,8 +62,8 @@ def _type_of(kind: Any, of: type, shape: tuple) -> type:
 
 def tensor_of(array: np.ndarray) -> Tensor:
     """A tensor with an array's values; it shares the array's memory where PyTorch can do so."""
-    # PyTorch refuses foreign byte orders and negative strides. `from_numpy` would warn of memory
-    # that is read-only.
+    # PyTorch refuses foreign byte orders and negative strides. `from_dlpack`, unlike `from_numpy`,
+    # does not warn of read-only memory.
     is_plain = array.dtype.isnative and min(array.strides, default=0) >= 0
     return torch.from_dlpack(array if is_plain else array.astype(array.dtype.newbyteorder("=")))
 

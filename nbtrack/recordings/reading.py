@@ -60,7 +60,7 @@ def read_frames(
     """Read frames of an opened recording into a sequence.
 
     Args:
-        frames: a slice, or the numbers of the frames.
+        frames: a slice, or a list of the numbers of the frames.
         needs_poses: leave out those frames of a slice that have no pose.
         origin: a point (m) in the recording's world, from which positions in the sequence count; by
             default `recording.origin`.
