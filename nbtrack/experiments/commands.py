@@ -161,9 +161,9 @@ def _opened(options: Namespace, preset: Preset) -> Scene:
 def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -> None:
     """Check that a given map was made as the command asks, before anything is tracked in it.
 
-    Raises ConfigError for `--map-frames`, for another field, and where the map was made with
-    another value of a setting that the user has chosen, or is corrected where `--method` names a
-    method that is not, or the other way round.
+    Raises ConfigError for `--map-frames`, for a map of another field, and for a map that was made
+    with another value of a setting that the user has chosen. With `--method` it also raises it if
+    only one of the map and the method is corrected.
     """
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")

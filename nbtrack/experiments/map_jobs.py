@@ -59,7 +59,10 @@ class MapJob(Job):
 
     @classmethod
     def of_given(cls, path: Path) -> Self:
-        """The job of a finished map that the user gives. Raises as `read_map` does."""
+        """The job of a finished map that the user gives.
+
+        Raises MissingError if there is no map, and DataError or ConfigError if it cannot be read.
+        """
         finished = _stored(path)
         name, record = finished.field.name, finished.record
         network, settings = record["network"], record["settings"]

@@ -27,8 +27,8 @@ def method_of(name: str | None, field: str | None, tracker: str | None) -> Metho
     first row of `METHODS` that has this tracker, or with NeuS if none has it. Without any argument
     it is `DEFAULT_METHOD`.
 
-    Raises ConfigError for a name together with a field or tracker, for a field in which no tracker
-    works, and as `find_methods` does.
+    Raises ConfigError for a name together with a field or tracker, for an unknown name, for a
+    tracker that does not work in the field, and for a field in which no tracker works.
     """
     if name and (field or tracker):
         raise ConfigError("--method names a field and a tracker: leave --field and --tracker out")

@@ -37,7 +37,10 @@ class Scene:
 
     @cached_property
     def recording(self) -> Recording:
-        """The scene's files, poses and calibration. Raises as `open_recording` does."""
+        """The scene's files, poses and calibration.
+
+        Raises MissingError, DataError or ConfigError if something is not there or is wrong.
+        """
         return open_recording(self.folder, self.format)
 
     @cached_property
@@ -48,8 +51,9 @@ class Scene:
     def read(self, frames: str = ":", **options: Any) -> RgbdSequence:
         """Read the frames of a slice such as `10:50:2`, and set depths that are outliers to 0.
 
-        Takes the other options of `read_frames`, and raises as it does. Images are read-only, since
-        all who read this scene share them, also the job that maps it.
+        `options` are other arguments of `read_frames`. Images are read-only, since all who read
+        this scene share them, also the job that maps it. Raises DataError if an image cannot be
+        read, or if no frame is left.
         """
         frame_ids = reading.parse_frames(frames)
         read = reading.without_outliers(reading.read_frames(self.recording, frame_ids, **options))
@@ -57,7 +61,10 @@ class Scene:
         return read
 
     def select(self, frames: str, needs_poses: bool = True) -> Frames:
-        """The numbers of the frames in a slice as `10:50:2`; raises as `select_frames` does."""
+        """The numbers of the frames in a slice such as `10:50:2`, by default only those with poses.
+
+        Raises DataError if the text is no slice, or if the slice selects no frame.
+        """
         return reading.select_frames(self.recording, reading.parse_frames(frames), needs_poses)
 
 

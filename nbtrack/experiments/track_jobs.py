@@ -93,7 +93,10 @@ class TrackJob(Job):
         return (self.folder / METRICS_FILE).is_file()
 
     def _true_path(self) -> Poses:
-        """True poses (m) of the tracked frames, NaN if unknown. Raises as `select_frames` does."""
+        """True poses (m) of the tracked frames, NaN if unknown.
+
+        Raises DataError if the text of the slice is wrong, or if it selects no frame.
+        """
         return self.scene.recording.T_world_camera[self.scene.select(self.frames, False)]
 
     def check(self) -> None:

@@ -151,7 +151,7 @@ def has_room_for(device: torch.device, n_bytes: int) -> bool:
 
 @contextlib.contextmanager
 def advise_on_memory(setting: str) -> Iterator[None]:
-    """Run a block; where the device or the host runs out of memory, raise OutOfMemory in one line.
+    """Run a block; if the device or the host runs out of memory in it, raise OutOfMemory.
 
     `setting` tells in the message what to lower, with its present value, as
     "tables.pixels.vr=1024".

@@ -45,7 +45,7 @@ def fetch_scene(name: str, folder: Path, source: str = DATASET_ZIP) -> str:
         with ProgressBar(f"fetching {name}", max(total, 1)) as bar:
             for path, info in missing.items():
                 with naming_damaged(source, "ZIP file", _AGAIN):
-                    content = archive.read(info)  # raises where the checksum is another
+                    content = archive.read(info)  # raises an error for a wrong checksum
                 write_atomic(folder / path, content)
                 done += info.compress_size
                 bar.move_to(done, f"{done / 1e6:.0f} of {total / 1e6:.0f} MB")

@@ -83,11 +83,11 @@ class Images:
         return images, digest.hexdigest(), recording.declared
 
     def arrays_of(self, ids: Frames) -> Decoded:
-        """Colours and depths of the frames with these numbers, of which there is at least one.
+        """Colours and depths of the frames with these numbers (at least one).
 
         They stay in memory for the next call. If the numbers rise in even steps, as those of a
-        slice do, the arrays are views of the memory, else copies. Raises DataError if a file is
-        damaged, or is of another kind or size.
+        slice do, the returned arrays are views of that memory; if not, they are copies. Raises
+        DataError if a file is damaged, or is of another kind or size.
         """
         camera = self.camera_of(ids[0])
         all_ids = np.union1d(self._ids, ids)
