@@ -173,6 +173,7 @@ def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
     z = np.arange(_CELL - half_z, half_z, _CELL)
     heights = np.linspace(HEIGHTS[0], HEIGHTS[1], 5)
     points = np.stack(np.meshgrid(x, heights, z, indexing="ij"), axis=-1)
+    # Distances (m) from surfaces on the grid of x and z: the smallest over the camera's heights.
     clearance = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:3]).min(axis=1)
     is_free = clearance >= CLEARANCE + 0.1  # m more, since smoothing moves the path
     # Costs fall with the distance from surfaces, which draws routes to the middle. No route enters
