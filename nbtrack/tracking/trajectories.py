@@ -51,7 +51,7 @@ def track_sequence(
     """
     _check_trackable(sequence)
     recipe = _recipe(tracker, sequence, is_start_known) if checkpoint else {}
-    kept, rows = files.Checkpoint(checkpoint, recipe), []
+    file, rows = files.Checkpoint(checkpoint, recipe), []
 
     def take_up(state: dict[str, Any]) -> None:
         tracker.restore(state["tracker"])
@@ -63,13 +63,13 @@ def track_sequence(
     else:
         tracker.restart_anywhere()
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
-        kept.resume(take_up)
+        file.resume(take_up)
         for index in range(first + len(rows), len(sequence)):
             is_found = is_start_known or not all(row.get("lost", False) for row in rows)
             budget = None if is_found else StepBudget(STEPS_TO_FIND)  # None: the tracker's own
             rows.append(_row(sequence, index, tracker.track(sequence[index], budget)))
             on_frame(index, rows[-1]["translation_error_m"])
-            kept.save(lambda: {"rows": rows, "tracker": tracker.state()})
+            file.save(lambda: {"rows": rows, "tracker": tracker.state()})
     T_estimated = np.stack(tracker.estimates[1:])  # the first is the start, no tracked frame
     return Trajectory(T_estimated, sequence.T_world_camera[first:].copy(), _table_of(rows))
 
