@@ -113,8 +113,8 @@ class CorrectedField(BakedField):
 def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     """Correct a map, in cells of `voxel` (m), by the frames that it was made from: see `corrected`.
 
-    The record of the new map has the time that the correction took, and the memory (bytes) of
-    network and correction.
+    The record of the new map has the time that the correction took, the memory (bytes) of network
+    and correction, and the misfit of the corrected map.
     """
     start = time.perf_counter()
     mapped, _ = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])

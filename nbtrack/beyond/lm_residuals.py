@@ -86,7 +86,7 @@ class Terms(NamedTuple):
 
 
 def grid_of(field: BakedField) -> Grid:
-    """Convert a baked field on the host."""
+    """Convert a baked field on the host for the compiled functions."""
     intensity = field.volume[:3].T @ torch.tensor(LUMA, dtype=torch.float32)
     value, confidence = field.volume[3:]
     vertices = torch.stack([value, intensity, confidence], dim=1).numpy()

@@ -69,13 +69,13 @@ class NeuSPlusField(NeuSField):
         rendering = self.composite(colors, sdf, rays, depths)
         # At measured points the distance is zero, and the colour is that of the pixel.
         surface_color, surface_sdf = self(surface.points(surface.depth[:, None])[:, 0])
-        measured = (surface.depth > 0).float()
+        is_measured = (surface.depth > 0).float()
         color_error = (surface_color - surface.color).abs().mean(dim=1)
         losses = {
             **rendered_losses(rendering, rays, lambda_color, lambda_depth),
             "sdf": settings.lambda_sdf * measured_mean((sdf - target).abs(), known),
-            "surface": settings.lambda_sdf * measured_mean(surface_sdf.abs(), measured),
-            "surface_color": settings.lambda_color * measured_mean(color_error, measured),
+            "surface": settings.lambda_sdf * measured_mean(surface_sdf.abs(), is_measured),
+            "surface_color": settings.lambda_color * measured_mean(color_error, is_measured),
         }
         if settings.lambda_eikonal:
             losses["eikonal"] = self._eikonal(rays.points(depths), settings, generator)

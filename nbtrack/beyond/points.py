@@ -98,8 +98,7 @@ def fuse_points(
             f"{extent.max() / _MAX_CELLS_A_SIDE:.2g} to {extent.max():.2g} m; set for instance 0.02"
         )
     shape = np.floor(extent / voxel).astype(np.int64) + 1
-    # Rows of x y z (m), red green blue and 1 by the voxel's number; merged, sums and a count.
-    tables = []
+    tables = []  # rows of x y z (m), red green blue and 1, indexed by the voxel's number
     for count, index in enumerate(frames.tolist(), start=1):
         frame = sequence[index]
         T_world_camera = sequence.T_world_camera[index]
@@ -110,6 +109,7 @@ def fuse_points(
         voxels, inside = cells_of(points_world, np.array(bounds.minimum), shape, voxel)
         values = np.column_stack([points_world, colors, np.ones(len(colors))])[inside]
         tables.append(pd.DataFrame(values, voxels))
+        # Merge: add up the rows of each voxel. The ones become its number of pixels.
         if count % _FRAMES_AT_ONCE == 0 or count == len(frames):
             tables = [pd.concat(tables).groupby(level=0).sum()]
     sums = tables[0].to_numpy()

@@ -45,8 +45,10 @@ def view_of(frame: Frame) -> View:
     of the size `_STEP`, and then interpolated along the view's directions.
     """
     camera = frame.camera
-    grey, depth_mm = frame.color.float().mean(dim=-1), frame.depth_mm.float()
-    parts = torch.stack([grey, depth_mm * (MILLIMETRE / _DEPTH_UNIT), (depth_mm > 0).float()])
+    luma, depth_mm = frame.color.float().mean(dim=-1), frame.depth_mm.float()
+    # Unmeasured depths are 0. The mean measured depth of a cell is the mean of all its depths,
+    # divided by the share of its pixels that are measured.
+    parts = torch.stack([luma, depth_mm * (MILLIMETRE / _DEPTH_UNIT), (depth_mm > 0).float()])
     n_rows = max(1, round(camera.height / (camera.fy * _STEP)))
     n_columns = max(1, round(camera.width / (camera.fx * _STEP)))
     blurred = adaptive_avg_pool2d(parts.to("cpu"), (n_rows, n_columns))
@@ -55,9 +57,9 @@ def view_of(frame: Frame) -> View:
     # Where the directions meet the picture, as `grid_sample` takes positions: it spans -1 to 1.
     u = 2 * (camera.fx * x + camera.cx) / camera.width - 1
     v = 2 * (camera.fy * y + camera.cy) / camera.height - 1
-    at = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
-    luma, depth, share = grid_sample(blurred[None], at[None], align_corners=False)[0]
-    luma_inside = luma.clamp(1, 255) * (at.abs() < 1).all(dim=-1)
+    uv = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
+    luma, depth, share = grid_sample(blurred[None], uv[None], align_corners=False)[0]
+    luma_inside = luma.clamp(1, 255) * (uv.abs() < 1).all(dim=-1)
     mean_depth = torch.where(share > 0.5, depth / share, 0).clamp(0, 255)
     return torch.stack([luma_inside, mean_depth]).round().byte()
 

@@ -108,7 +108,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     as_declared = Reading(recording.declared, sequence.intrinsics)
     no_depth = findings.no_depth_value(counts, frames)
-    sequence.depths_mm[sequence.depths_mm == no_depth] = 0
+    sequence.depths_mm[sequence.depths_mm == no_depth] = 0  # changes nothing if `no_depth` is 0
     frame_pairs = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(frame_pairs, as_declared)
     cloud = _cloud(as_declared, sequence)
@@ -119,7 +119,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     causes = ProgressBar("fitting", CAUSES.items() if declared_is_best and has_enough else [])
     misfits = [fit(frame_pairs, as_declared, as_declared, name, keys) for name, keys in causes]
     main = main_misfits(frame_pairs, as_declared, misfits)
-    misread = findings.misreading(conventions[0], best, main)  # at most one sentence, by its kind
+    misread = findings.misreading(conventions[0], best, main)  # a sentence by its kind, or empty
     faults = [*findings.of_images(frames, no_depth, counts[0]), *misread.get("fault", [])]
     doubts, remarks = misread.get("doubt", []), misread.get("note", [])
     if declared_is_best:  # otherwise the numbers of poses and depths mean nothing
@@ -211,7 +211,7 @@ def _read(
 def _add_motion(frames: pd.DataFrame, T_world_camera: Poses) -> None:
     """Add the columns `moved_mm`, `turned_deg` and `off_mm` to the table of `_read`.
 
-    The table's index are numbers of frames, and `T_world_camera` are the poses of all frames.
+    The index of the table holds numbers of frames. `T_world_camera` has the poses of all frames.
     """
     moves_mm = 1e3 * np.diff(T_world_camera[:, :3, 3], axis=0, prepend=np.nan)
     off_mm = np.diff(moves_mm, axis=0, append=np.nan) / 2  # from the middle of both neighbours

@@ -110,8 +110,7 @@ def on_grid(values: UInt16[np.ndarray, "frames h w"], stride: int) -> tuple[Tens
     Returns the n pixels' columns (n,), their rows (n,), and their values (frames, n).
     """
     sampled = torch.from_numpy(values[:, ::stride, ::stride].astype(np.float32))
-    indices = stride * torch.from_numpy(np.indices(sampled.shape[1:]))  # (2, rows, columns)
-    rows, columns = indices.flatten(1)
+    rows, columns = stride * torch.from_numpy(np.indices(sampled.shape[1:])).flatten(1)
     return columns, rows, sampled.flatten(1)
 
 
