@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
@@ -27,7 +26,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cheap_defaults() -> Iterator[None]:
+def cheap_defaults():
     """Most tests do not look at what their maps are worth; and where none says how many workers it
     wants, jobs run here: each worker would import torch for seconds."""
     with pytest.MonkeyPatch.context() as patch:
@@ -38,7 +37,7 @@ def cheap_defaults() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def settings_stay_inside(tmp_path: Path) -> Iterator[None]:
+def settings_stay_inside(tmp_path: Path):
     """A cache for each test, unless its module has one; and what a command sets for its own process
     must not reach the next test."""
     import torch

@@ -1,4 +1,7 @@
-"""The command line: what commands print and write. What they refuse: `test_faults.py`."""
+"""The command line: what commands print and write. What they refuse: `test_faults.py`.
+
+And what is printed while they run and no bar is shown: a line every 30 seconds.
+"""
 
 import json
 import os
@@ -6,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -23,6 +27,7 @@ from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import naming_damaged, runs_folder
 from nbtrack.machinery.inputs import read_object
+from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.recording import open_recording
 
@@ -223,3 +228,45 @@ def test_the_home_folder_is_meant_by_its_sign(tmp_path: Path, monkeypatch) -> No
     assert main(mapped) == 0
     assert read_map("~/map").field.name == "points"
     assert not (tmp_path / "~").exists()
+
+
+@pytest.fixture
+def clock(monkeypatch) -> SimpleNamespace:
+    """That of the bars, in seconds, moved by hand."""
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr("tqdm.std.time", lambda: clock.now)
+    return clock
+
+
+def test_a_line_now_and_then(clock, capsys) -> None:
+    """Catches output that is silent until the end, or never, and an ETA that is not from the mean
+    speed: 2 of 8 parts in 31 seconds leave 93."""
+    with ProgressBar("mapping", 8) as bar:
+        for clock.now, done in ((31, 2), (40, 3), (90, 8)):
+            bar.move_to(done, "loss 0.5")
+    first, *others = capsys.readouterr().err.splitlines()
+    assert first == "mapping: 25 %, 00:31 gone, 01:33 left, loss 0.5"
+    assert {*others} == {"mapping: 100 %, 01:30 gone, 00:00 left, loss 0.5"}
+
+
+def test_a_warm_up_is_left_out(clock, capsys) -> None:
+    """Catches hours that are left for half an hour, because the first frame was compiled."""
+    with ProgressBar("tracking", 60) as bar:
+        clock.now = 600
+        bar.end_warm_up(1)
+        bar.move_to(1)
+        clock.now = 631
+        bar.move_to(2)
+    first, second, *_ = capsys.readouterr().err.splitlines()
+    assert "? left" in first
+    assert "29:58 left" in second  # 58 times 31 s
+
+
+def test_short_and_hidden_work_is_silent(clock, capsys) -> None:
+    """Catches noise about what takes no time, and about what nobody asked to see."""
+    with ProgressBar("short", 1) as bar:
+        bar.move_to(1)
+    with ProgressBar("hidden", 1, is_shown=False) as bar:
+        clock.now = 60
+        bar.move_to(1)
+    assert capsys.readouterr().err == ""

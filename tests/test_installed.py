@@ -1,4 +1,7 @@
-"""Installed elsewhere: everything below the current folder, and missing extras in a line."""
+"""Installed elsewhere: everything below the current folder, and missing extras in a line.
+
+And keys follow the code: what changes a result changes its key, what does not leaves it alone.
+"""
 
 import importlib.util
 import os
@@ -12,8 +15,15 @@ from test_faults import assert_refused
 from test_own_method import OWN
 from tiny import TINY
 
+from nbtrack import provenance
 from nbtrack.beyond import observed
+from nbtrack.experiments.map_jobs import MapJob
+from nbtrack.experiments.scenes import Scene
+from nbtrack.experiments.track_jobs import TrackJob
+from nbtrack.fields import FIELDS, NetworkSettings, NeuSField
 from nbtrack.machinery import files
+from nbtrack.synthetic import make_room
+from nbtrack.tracking import TRACKERS, SdfTracker, TrackerSettings
 
 
 @pytest.fixture
@@ -103,3 +113,101 @@ def test_a_script_without_a_guard(tmp_path: Path) -> None:
         "maps": 2, "tracks": 2,
     }  # fmt: skip
     assert "Traceback" not in done.stderr
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch):
+    """A copy of the package's sources, to be edited."""
+    copy = tmp_path / "nbtrack"
+    shutil.copytree(provenance.PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(provenance, "PACKAGE", copy)
+    yield copy
+    provenance.package_code.cache_clear()
+
+
+def key() -> str:
+    provenance.package_code.cache_clear()
+    return provenance.code_fingerprint(SdfTracker)
+
+
+EDITED = [
+    ("fields/rendering.py", True), ("core/geometry.py", True), ("beyond/correction.py", True),
+    ("experiments/quality.py", True), ("recordings/reading.py", True),
+    ("checks/check.py", False), ("plots/rooms.py", False), ("cli.py", False),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("file", "counts"), EDITED)
+def test_what_changes_a_key(package: Path, file: str, counts: bool) -> None:
+    """Catches an edited loss or score that is answered from the cache, and results lost for a
+    picture."""
+    before = key()
+    (package / file).write_text((package / file).read_text() + "\nEDITED = True\n")
+    assert (key() != before) == counts
+
+
+def classes_of_ones_own() -> tuple[type, ...]:
+    """Written anew, as by a cell that runs again."""
+
+    class Mine(SdfTracker):
+        pass
+
+    class Promised(SdfTracker):
+        version = "1"
+
+    class Later(Promised):
+        pass
+
+    class Next(Promised):
+        version = "2"
+
+    return Mine, Promised, Later, SdfTracker, Next
+
+
+def test_classes_of_ones_own(capsys) -> None:
+    """Catches an edited class that is answered from the cache, one that says its version and is
+    made anew, and a class that lives on the promise of its base."""
+    keys = [map(provenance.code_fingerprint, classes_of_ones_own()) for _ in range(2)]
+    mine, promised, later, ours, newer = map(set, zip(*keys, strict=True))
+    assert len(mine | later) == 4
+    assert len(promised) == len(ours) == len(newer) == 1
+    assert len(mine | later | promised | ours | newer) == 7
+    told = capsys.readouterr().err.splitlines()
+    assert [line.split()[5].split(".")[-1] for line in told] == 2 * ["Mine"] + 2 * ["Later"]
+    assert 'version = "1"' in told[0]
+
+
+def test_a_class_is_its_own_key(tmp_path: Path, monkeypatch, capsys) -> None:
+    """Catches a map made anew for each row, or for another tracker, and results of a class that has
+    been written anew, as by a cell that runs again."""
+
+    def keys() -> tuple[str, str]:
+        made = MapJob(scene, "mine", None, settings)
+        return made.key, TrackJob(made, scene, "mine", settings, steps=1).key
+
+    def write_anew(registry, base: type) -> None:
+        monkeypatch.setitem(registry, "mine", type("Mine", (base,), {"name": "mine"}))
+
+    scene = Scene("office", make_room("office", tmp_path / "office", 2, 16, 12))
+    settings = TrackerSettings()
+    write_anew(FIELDS, NeuSField)
+    write_anew(TRACKERS, SdfTracker)
+    before = keys()
+    assert keys() == before
+    assert len(capsys.readouterr().err.splitlines()) == 2  # for each class once
+    write_anew(TRACKERS, SdfTracker)
+    after = keys()
+    assert after[0] == before[0]
+    assert after[1] != before[1]
+    write_anew(FIELDS, NeuSField)
+    assert not {*keys()} & {*before, *after}
+
+
+def test_what_a_fingerprint_tells_apart() -> None:
+    """Catches a cache that mixes up settings, or makes results twice because a step count was
+    written 30 and 30.0, or settings in another order; large seeds that floats round alike."""
+    assert files.fingerprint(2**53) != files.fingerprint(2**53 + 1)
+    whole = files.fingerprint(30, {"a": [1], "b": 2})
+    assert whole == files.fingerprint(30.0, {"b": 2.0, "a": [1.0]})
+    wide, narrow = NetworkSettings(), NetworkSettings(width=255)
+    assert len({files.fingerprint(*parts) for parts in ((wide, 0), (wide, 1), (narrow, 0))}) == 3
