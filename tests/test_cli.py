@@ -164,8 +164,6 @@ def test_a_recording_without_poses_is_tracked_in_a_map(work: Path, capsys, monke
     shutil.copytree(work / "map", work / "corrected")
     again = ["export", "elsewhere", "--to", "gif", "again.gif"]
     assert_refused(work, capsys, again, "is not the map of this run any more")
-    says = "or track in a map of the same place with --map-from"
-    assert_refused(work, capsys, ["track", str(recording)], says)
 
 
 def test_help_is_true_for_its_command(capsys) -> None:

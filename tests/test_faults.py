@@ -84,7 +84,6 @@ def _cache_in_a_loop_of_links() -> None:
 # Settings in files; more kinds in test_settings.py.
 TOML = {
     "binary": (b"\x00\xff\xfe", "readable TOML"),
-    "no TOML": (b"width: 3", "readable TOML"),
     "unknown key": (b"[mapping.neus]\niteration = 3", "did you mean 'mapping.neus.iterations'"),
     "date": (b"[mapping.neus]\niterations = 2020-01-01", "must be int"),
     "deep list": (b"tables.rates_hz = " + b"[" * 5000, "readable TOML"),

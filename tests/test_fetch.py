@@ -122,7 +122,6 @@ def test_what_cannot_be_fetched(archive: Path, tmp_path: Path, serve, capsys, mo
         *(([*FETCH, place], "not a readable ZIP") for place in (serve(page)[0], str(page))),
         ([*FETCH, "http://127.0.0.1:9/data.zip"], "not a readable ZIP file"),
         ([*FETCH, str(tmp_path / "no.zip")], "no file"),
-        (["data", "fetch", "breakfast"], "did you mean"),
         *((other, "no images and depth in a folder 'whiteroom'") for other in others),
     ]
     for command, says in cases:

@@ -105,10 +105,8 @@ def test_depth_and_poses_of_a_phone(tmp_path: Path, monkeypatch) -> None:
 
 
 def test_a_sequence(scene: Path) -> None:
-    """Catches units mixed up, frames selected in file order, and copies of what could be shared."""
+    """Catches frames selected in file order, and copies of what could be shared."""
     sequence = read_sequence(scene)
-    np.testing.assert_allclose(sequence.depth(1), sequence.depths_mm[1] / 1000.0, rtol=1e-6)
-    np.testing.assert_allclose(sequence.color(1) * 255, sequence.colors[1], atol=1e-4)
     chosen = sequence.select(np.array([2, 0]))
     assert chosen.frame_ids.tolist() == [2, 0]
     check_equal(chosen, Source(*(a[[2, 0]] for a in source()[:3])))
@@ -130,14 +128,6 @@ def test_frames_without_a_pose_are_left_out_and_counted(scene: Path, tmp_path: P
         assert np.array_equal(sequence.colors, source().colors[[0, 2, 3, 5]])
     assert read_sequence(scene, slice(0, 3)).frame_ids.tolist() == [0, 2]
     assert len(select_frames(open_recording(scene), slice(None), needs_poses=False)) == 6
-
-
-@pytest.mark.parametrize("text", [":", "2:", "1:5:2", "-2:", "3:100"])
-def test_frame_slices_are_pythons(scene: Path, text: str) -> None:
-    """Catches a slice that is applied after NaN frames are gone, or an end that is included."""
-    sequence = read_sequence(scene, parse_frames(text))
-    assert sequence.frame_ids.tolist() == list(range(6))[parse_frames(text)]
-    assert np.array_equal(sequence.depths_mm, source().depths_mm[sequence.frame_ids])
 
 
 @pytest.mark.parametrize("text", ["", "5", "a:b", "1:2:3:4", "1.5:2", "0:10:0", "0:10:-1"])

@@ -148,20 +148,9 @@ def test_what_changes_a_key(package: Path, file: str, counts: bool) -> None:
 
 def classes_of_ones_own() -> tuple[type, ...]:
     """Written anew, as by a cell that runs again."""
-
-    class Mine(SdfTracker):
-        pass
-
-    class Promised(SdfTracker):
-        version = "1"
-
-    class Later(Promised):
-        pass
-
-    class Next(Promised):
-        version = "2"
-
-    return Mine, Promised, Later, SdfTracker, Next
+    promised = type("Promised", (SdfTracker,), {"version": "1"})
+    mine, later = type("Mine", (SdfTracker,), {}), type("Later", (promised,), {})
+    return mine, promised, later, SdfTracker, type("Next", (promised,), {"version": "2"})
 
 
 def test_classes_of_ones_own(capsys) -> None:

@@ -92,6 +92,18 @@ def as_on_a_gpu(monkeypatch) -> None:
     monkeypatch.setattr(launches, "can_record", lambda device: True)
 
 
+@pytest.fixture
+def both_ways(as_on_a_gpu, monkeypatch):
+    """What some work gives on tape, and by calls."""
+
+    def found(work, *arguments):
+        for record in (on_tape, by_calls):
+            monkeypatch.setattr(launches, "record", record)
+            yield work(*arguments)
+
+    return found
+
+
 class Own(AdamTracker):
     """What a user may write: distances alone, in quarters of a metre."""
 
@@ -111,7 +123,7 @@ class Choosy(Own):
         return super().loss(T_world_camera, directions_camera[near], color[near], depth[near])
 
 
-CPU, on_tapes = torch.device("cpu"), pytest.mark.usefixtures("as_on_a_gpu")
+CPU = torch.device("cpu")
 
 
 def tracked(kind: type, field_name: str, device: torch.device = CPU) -> np.ndarray:
@@ -125,17 +137,13 @@ FIELDS = ("imap", "neus", "neus_plus")
 PAIRS = (SdfTracker, "neus"), (VrTracker, "imap"), (VrTracker, "neus"), (Own, "neus")
 
 
-@on_tapes
 @pytest.mark.parametrize(("kind", "field_name"), PAIRS)
-def test_a_replayed_step_is_the_step(kind: type, field_name: str, monkeypatch) -> None:
+def test_a_replayed_step_is_the_step(kind: type, field_name: str, both_ways) -> None:
     """Catches a step that keeps the pixels, images, moments or random numbers of the recording, and
     one that reads a value on the host."""
-    found = []
-    for record in (on_tape, by_calls):
-        monkeypatch.setattr(launches, "record", record)
-        found.append(tracked(kind, field_name))
-    np.testing.assert_array_equal(*found)
-    assert np.abs(np.diff(found[0], axis=0)).max(axis=(1, 2)).min() > 1e-4  # each frame moves
+    replayed, called = both_ways(tracked, kind, field_name)
+    np.testing.assert_array_equal(replayed, called)
+    assert np.abs(np.diff(replayed, axis=0)).max(axis=(1, 2)).min() > 1e-4  # each frame moves
 
 
 def totals(name: str, device: torch.device = CPU) -> list[float]:
@@ -148,21 +156,16 @@ def totals(name: str, device: torch.device = CPU) -> list[float]:
     return [row["total"] for row in fit.history]
 
 
-@on_tapes
 @pytest.mark.parametrize("name", FIELDS)
-def test_a_replayed_iteration_is_the_iteration(name: str, monkeypatch) -> None:
+def test_a_replayed_iteration_is_the_iteration(name: str, both_ways) -> None:
     """Catches a batch or a learning rate that stays, values read on the host, and a loss that the
     next replay writes over."""
-    found = []
-    for record in (on_tape, by_calls):
-        monkeypatch.setattr(launches, "record", record)
-        found.append(totals(name))
-    assert found[0] == found[1]
-    assert len(set(found[0])) == 12
+    replayed, called = both_ways(totals, name)
+    assert replayed == called
+    assert len(set(replayed)) == 12
 
 
-@on_tapes
-def test_what_waits_is_called(capsys, monkeypatch) -> None:
+def test_what_waits_is_called(as_on_a_gpu, capsys, monkeypatch) -> None:
     """Catches a loss that cannot be recorded and is; and one that is told of at every step."""
     monkeypatch.setattr(launches, "record", None)
     tracked(Choosy, "neus")
