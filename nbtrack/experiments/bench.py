@@ -138,8 +138,8 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     scene's map is made if it is not cached.
 
     Returns a row for each cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps and
-    steps_std (mean and deviation over repetitions), and converged (whether every search ended
-    before the budget did). Source: paper, Table II and evaluation protocol.
+    steps_std (mean and standard deviation over repetitions), and converged (whether every search
+    ended before the budget did). Source: paper, Table II and evaluation protocol.
     """
     method_of = {}
     for method in find_methods(methods):

@@ -129,6 +129,7 @@ def _summary(metrics: dict[str, Any]) -> Iterator[str]:
         yield f"lost   {share:.1%} of the frames, off by more than {LOST_THRESHOLD_M:g} m"
     else:
         yield "error  no true pose is known of the tracked frames: errors cannot be computed"
+    # A count of None gives no line. What the tracker says is a line even if it is 0.
     counts = {
         "of the frames lost, as the tracker itself says": metrics.get("flagged_frames"),
         "of the frames without a true pose, in no error": n_unknown or None,
@@ -211,7 +212,8 @@ def check_command(options: Namespace) -> int:
     recording = open_recording(options.folder, options.format, options.depth_folder, options.poses)
     report = check_recording(recording)
     if options.out:
-        declared = report.conventions[0]
+        declared = report.conventions[0]  # as the recording is declared; others follow
+        # The distance between surfaces is stored as a share of the depth.
         apart_mm = 1e3 * declared.apart * declared.depth_m
         title = f"{recording.name}: surfaces of two frames lie {apart_mm:.1f} mm apart in the mean"
         figure = plot_overview(report.cloud, {"true": report.T_world_camera}, None, title)

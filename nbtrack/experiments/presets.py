@@ -171,6 +171,7 @@ def default_settings() -> dict[str, Any]:
 def _defaults(fields: Classes, trackers: Classes) -> dict[str, Any]:
     """The tree of the defaults of all settings classes, for these fields and trackers."""
     learned = {name: kind for name, kind in fields if issubclass(kind, LearnedField)}
+    # Fields with a class of network settings of their own.
     networks = {n: k.Network() for n, k in learned.items() if k.Network is not NetworkSettings}
     return {
         "network": _NETWORKS | networks,

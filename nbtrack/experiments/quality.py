@@ -89,6 +89,7 @@ def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room)
     is_in_front = torch.arange(len(rays.depth)) % 2 == 0
     near_surface = rays.depth + NEAR * (2 * offsets - 1)
     depths = torch.where(is_in_front, rays.depth * offsets, near_surface)
+    # `points` takes several depths for each ray; here it is one.
     points_world = rays.points(depths[:, None])[rays.depth > 0, 0].double().numpy()
     true_sdf = room.sdf(points_world)
     _, sdf = query_field(field, points_world)

@@ -150,7 +150,7 @@ class TrackJob(Job):
         tracked = track_sequence(tracker, sequence, checkpoint, report_frame, is_start_known)
         notes = self._notes(finished, sequence, tracked, warning)
         notes["device"] = device_name(tracker.device)  # the CPU for LM and ICP
-        if warning == _OTHER_WORLD:
+        if warning == _OTHER_WORLD:  # moves the true poses into the map's world, for the errors
             tracked, is_explained = in_world_of_map(tracked)
             notes["map_warning"] = warning if is_explained else None
         metrics = scores_of(tracked) | self._provenance(finished) | notes

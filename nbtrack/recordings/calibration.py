@@ -65,7 +65,8 @@ class Calibration:
         old_cx, old_cy = self.principal_point or (width / factor / 2, height / factor / 2)
         cx, cy = factor * old_cx, factor * old_cy
         # Resizing rounds sides to whole pixels, so that heights may differ by one.
-        if not (abs(factor * old_height - height) <= 1 and 0 <= cx <= width and 0 <= cy <= height):
+        has_proportions = abs(factor * old_height - height) <= 1
+        if not (has_proportions and 0 <= cx <= width and 0 <= cy <= height):
             found = f"{image} is {width}x{height} but {self.source} is for {old_width}x{old_height}"
             advice = "images may be resized but not cropped; give their own camera, or its size"
             raise DataError(f"{found}, with cx, cy then at ({cx:.0f}, {cy:.0f}): {advice}")

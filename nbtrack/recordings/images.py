@@ -139,7 +139,7 @@ class Images:
         """
         recording, shape = self.recording, (self._camera.height, self._camera.width)
         color, depth = self._first.pop(index, None) or self._pixels(index)
-        if self._resize:
+        if self._resize:  # OpenCV takes the width first
             color = cv2.resize(color, shape[::-1], interpolation=cv2.INTER_AREA)
         _check(recording.color_files[index], color, np.uint8, (*shape, 3), self._sized)
         _check(recording.depth_files[index], depth, np.uint16, shape, self._sized)
@@ -168,6 +168,7 @@ class Images:
         depths_mm = np.empty_like(depths)
         for place, index in enumerate(ids):
             depth_mm = depths[place] * (1000 / declared.depth_scale) / slant
+            # The true depth is m + depth_error_per_m * m² for a measured m; here in millimetres.
             depth_mm *= 1 + declared.depth_error_per_m / 1000 * depth_mm
             if depth_mm.max() > _MAX_16_BITS:
                 found = f"{self.recording.depth_files[index]} holds {depth_mm.max() / 1000:.4g} m"

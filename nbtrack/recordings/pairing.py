@@ -70,7 +70,8 @@ def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Pat
     depth_times, depths = _read_list(depth_list)
     depth_of_color = nearest(color_times, depth_times, _TOLERANCE)
     color_of_depth = nearest(depth_times, color_times, _TOLERANCE)
-    # Where `depth_of_color` is -1, it takes the last depth map here; the next line leaves it out.
+    # An image without a depth map has the index -1, which is the last depth map's in this line. The
+    # next line leaves such images out.
     is_mutual = color_of_depth[depth_of_color] == np.arange(len(colors))
     paired = np.flatnonzero((depth_of_color >= 0) & is_mutual)  # indices of images
     of_all = f"{len(colors) - len(paired)} of the {len(colors)} images in {color_list.name}"
@@ -235,7 +236,7 @@ def _interpolated(
     is_between = (before + after <= _GAP) & (to_nearest > 1e-6)
     if not is_between.any():
         return found, ""
-    T_knots, wanted = flip(poses), times[is_between]
+    T_knots, wanted = flip(poses), times[is_between]  # camera-to-world poses at the stamps; s
     T_wanted = np.tile(np.eye(4), (len(wanted), 1, 1))
     T_wanted[:, :3, 3] = interp1d(stamps, T_knots[:, :3, 3], axis=0)(wanted)
     turning = Slerp(stamps, Rotation.from_matrix(T_knots[:, :3, :3]))

@@ -163,8 +163,8 @@ def from_quaternions(rows: Float[np.ndarray, "n 8"], order: str, path: Path) -> 
 
     `order` names the quaternion's four columns, as "xyzw". A pose is NaN if a number of its row is
     not finite or its quaternion is zero: so tools write a frame in which tracking was lost. Raises
-    DataError, which names `path`, for a time that is not finite and for other quaternions that have
-    no unit norm.
+    DataError, which names `path`, if the time of any other pose is not finite, or if its quaternion
+    has no unit norm.
     """
     times = in_seconds(rows[:, 0])
     # Clipped numbers are still so large that they are refused below, and overflow nothing.
