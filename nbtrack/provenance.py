@@ -40,8 +40,8 @@ def code_fingerprint(kind: type) -> str:
     They change with the files of this package, and with the version of the installed package that
     the class is from. For a class from elsewhere, as a user's file, a notebook or an editable
     installation, they change with its qualified name and its attribute `version`, but not with its
-    code. Without a `version` they are others in every process, so that no process uses results of
-    another one, and a printed line says so.
+    code. Without a `version` the digits differ from process to process, so that no process uses
+    results of another one, and a printed line says so.
     """
     return fingerprint(package_code(*_FOLDERS), _code_of(kind))
 

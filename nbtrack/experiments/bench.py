@@ -48,7 +48,8 @@ def tables_command(options: Namespace) -> None:
     methods = find_methods(options.method.split(",") if options.method else usual)
     # All of the following raise an error for a wrong option, before a room is made.
     execution = Execution(options.workers, options.dask, keep_going=True)
-    if options.label and (label := label_of(options.label)) != options.label:
+    label = label_of(options.label) if options.label else options.label
+    if label != options.label:
         tell(f"nbtrack: LaTeX has no label {options.label!r}: it is {label!r} in the tables")
     wording = Wording(options.caption, options.label, dict(map(_label_of, preset.scenes.labels)))
     prepare(options.out)

@@ -73,8 +73,8 @@ class Images:
         files = recording.color_files + recording.depth_files
         for file in files:
             if file not in self._digests:
-                content = self._content(file)
-                if len(content) < self._bytes_left:
+                content = self._content(file)  # stores the digest
+                if len(content) < self._bytes_left:  # then it is decoded without another read
                     self._contents[file] = content
                     self._bytes_left -= len(content)
         images = [(file.parent.name, file.name, self._digests[file]) for file in files]

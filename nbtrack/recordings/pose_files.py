@@ -119,7 +119,7 @@ def check_order(files: list[Path]) -> None:
     if len(kinds) > 1 or (None in stamps and is_mixed):
         found = f"{names} differ in more than their numbers, or in how these are written"
         raise DataError(f"{found}, which tells no order: number the images as they were recorded")
-    # All names now have equally many numbers: a column for each place of a number in the names.
+    # All names have the same form here, so that there is a column for each number in a name.
     for numbers in np.array([_numbers_in(path) for path in files]).T:
         steps = np.diff(numbers)
         is_counter = len(set(numbers.tolist())) == len(files) and np.ptp(numbers) < 2 * len(files)
