@@ -83,6 +83,7 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
 def track_command(options: Namespace) -> None:
     """Track a sequence in a map that is given, or in its own, which is made if it is missing."""
     given = MapJob.of_given(options.map_from) if options.map_from else None
+    # The field is that of a given map, unless the user names another one.
     field = given.field if given and not (options.field or options.method) else options.field
     method = method_of(options.method, field, options.tracker)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
