@@ -1,4 +1,4 @@
-"""What goes beyond the paper: fields, trackers and methods that join as a plug-in does."""
+"""Fields, trackers and methods beyond the paper, which are registered here as by a plug-in."""
 
 from nbtrack.fields import FIELDS
 from nbtrack.mapping.files import FORMS
@@ -17,7 +17,8 @@ FORMS["corrected"] = "nbtrack.beyond.correction:CorrectedField"
 
 _COLOR_ONLY = ("tracking.vr.lambda_depth=0",)
 _NEUS_CORRECTED = ("correction.neus=0.04",)
-# As good as from 1400 iterations, in half the time (benchmarks/README.md; rooms for tuning).
+# In the rooms for tuning 600 iterations are as good as 1400, in half the time
+# (benchmarks/README.md).
 _CORRECTED = ("correction.neus_plus=0.04", "mapping.neus_plus.iterations=600")
 _SPARSE = (*_CORRECTED, "tracking.lm.n_pixels=512")
 _MIDDLE = (*_CORRECTED, "tracking.lm.n_pixels=2048")

@@ -148,7 +148,7 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     uncorrected = grid.volume[:4].T.double().numpy()[numbers]
     color_before, distance_before = uncorrected[:, :3], uncorrected[:, 3:]
     reliability = (depth.mean() / depth) ** 2
-    wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ distance_before
+    wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ distance_before  # changes, m
     reliabilities = np.tile(reliability, len(_OFFSETS))
     # Residuals above 1 cm are down-weighted.
     distance, diagonal = solve(matrix, wanted, reliabilities, regularisation, 0.01, rounds=4)

@@ -99,7 +99,7 @@ def solve(
         largest = np.abs(wanted - matrix @ solution).max(axis=1)
         weights = reliability * huber / np.maximum(largest, huber)
 
-        def hessian_times(x, weights=weights):  # weights of this round
+        def hessian_times(x, weights=weights):  # keeps the weights of this round
             return matrix.T @ (weights * (matrix @ x)) + regularisation @ x
 
         hessian = LinearOperator(regularisation.shape, matvec=hessian_times, dtype=float)

@@ -203,8 +203,8 @@ class FeatureGrid(nn.Module):
         extent = self.low.new_tensor(bounds.maximum) - self.low
         self.voxels = [settings.finest * 2**level for level in range(settings.levels)]
         shapes = [((extent / voxel).ceil().long() + 1).tolist() for voxel in self.voxels]
-        drawn = {"generator": generator, "dtype": torch.float32}
-        volumes = [torch.randn(settings.features, *shape, **drawn) for shape in shapes]
+        options = {"generator": generator, "dtype": torch.float32}
+        volumes = [torch.randn(settings.features, *shape, **options) for shape in shapes]
         self.volumes = nn.ParameterList(0.01 * volume for volume in volumes)
         self.layer = empty_linear(settings.levels * settings.features + 3, settings.hidden)
         self.head = empty_linear(settings.hidden, 4)  # colour and value

@@ -127,8 +127,9 @@ def _normals(depth_mm: Array, pinhole: tuple, points: Array) -> Array:
             above, below = depth_mm[v - reach, u], depth_mm[v + reach, u]
             jump = max(abs(left - z), abs(right - z), abs(above - z), abs(below - z))
             if jump < PLANE_JUMP * z:
-                # a and b are how fast the logarithm of the depth grows along x / z and y / z. Then
-                # (a, b, c) is normal to the plane.
+                # On a plane with the normal m, ln(depth) has the derivative -m_x / (m' ray) along
+                # the x of the ray (x, y, 1), and likewise along y. Here m = (a, b, c) is scaled to
+                # m' ray = -1, so that it points towards the camera.
                 a = fx / reach * (right - left) / (right + left)
                 b = fy / reach * (below - above) / (below + above)
                 c = -1 - x * a - y * b
