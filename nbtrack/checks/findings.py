@@ -65,7 +65,7 @@ def misreading(declared: Convention, best: Convention, main: list[Misfit]) -> di
 
 
 def doubts_of_poses(conventions: list[Convention], file: str, needs_proof: bool) -> Iterator[str]:
-    """A sentence that says why it is unknown whether poses are read rightly; none if it is known.
+    """A doubt if it cannot be told whether the poses are read rightly.
 
     The reason is that two frames see too little of the same, or, if `needs_proof`, that the camera
     moves too little to tell conventions apart. The declared one must come first in `conventions`.
@@ -98,7 +98,7 @@ def no_depth_value(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) ->
 
 
 def of_images(frames: pd.DataFrame, no_depth: int, often: Int[np.ndarray, "_"]) -> Iterator[str]:
-    """What is wrong with images, whatever their numbers mean.
+    """Faults of images that do not depend on what their numbers mean.
 
     `no_depth` is the result of `no_depth_value`, and `often[v]` how often the depth value v occurs.
     """
@@ -119,7 +119,7 @@ def of_images(frames: pd.DataFrame, no_depth: int, often: Int[np.ndarray, "_"]) 
 
 
 def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
-    """Poses that are read rightly, but lie beside the path of their neighbours."""
+    """A fault if poses are read rightly, but some lie beside the path of their neighbours."""
     off = frames.off_mm / 1e3  # m
     is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)
     # An odd pose also moves the middles that its neighbours are compared with, by half as much. So
@@ -134,7 +134,7 @@ def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
 
 
 def of_units(depth: pd.Series) -> Iterator[str]:
-    """A median depth (m) that no camera measures, though depths and poses fit each other."""
+    """A fault if no camera measures the median depth (m), though depths and poses agree."""
     near, far = PLAUSIBLE_DEPTH
     median = depth.median()
     if median < near or median > far:

@@ -134,7 +134,8 @@ def fit(
 ) -> Misfit:
     """Fit the numbers `keys` of the cause `name`, while all others stay as declared.
 
-    The fit begins at the numbers that the reading `start` has.
+    The fit begins at the numbers that the reading `start` has. Each Gauss-Newton step is tried at
+    several lengths, and the scale of its weights follows the gaps.
     """
     # The unit of a step is what is negligible of each number, so that all are of similar size.
     limit, unit = np.array([(_NUMBERS[key].limit, _NUMBERS[key].negligible) for key in keys]).T
