@@ -250,6 +250,7 @@ def _told_by_files(folder: Path) -> str:
     maximum = max(shares.values())
     best = [name for name, share in shares.items() if share == maximum]
     if maximum == 0:
+        # For each format the first pattern of each group.
         files = (f"{name} ({', '.join(p[0] for p in FORMATS[name].needs)})" for name in best)
         raise MissingError(f"{folder} is no recording: it needs the files of {'; '.join(files)}")
     if len(best) > 1 and maximum == 1:

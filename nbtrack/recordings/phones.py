@@ -48,6 +48,7 @@ def _record3d_poses(path: Path, order: str) -> tuple[Poses, Times]:
     content = read_object(path, "JSON")
     rows = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)  # qx qy qz qw tx ty tz
     times = np.array(content.get("frameTimestamps", ()), dtype=np.float64)
+    # Without a time for each frame, frame numbers and the rate give the times.
     if times.shape != (len(rows),) or not np.isfinite(times).all():
         times = np.arange(len(rows)) / float(content["fps"])
     return from_quaternions(np.column_stack([times, rows[:, 4:], rows[:, :4]]), "xyzw", path)

@@ -148,7 +148,7 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times]:
     numbers = read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
     if numbers.shape[1] == 8:
         return from_quaternions(numbers, quaternion, path)
-    if numbers.shape == (3, 4):
+    if numbers.shape == (3, 4):  # the rows of a single 3x4 matrix
         numbers = numbers.reshape(1, 12)
     if numbers.shape[1] == 12:
         numbers = np.hstack([numbers, np.tile([0.0, 0, 0, 1], (len(numbers), 1))])
