@@ -236,8 +236,8 @@ def test_an_estimate_is_the_users_own() -> None:
 
 def test_motion_models() -> None:
     """Catches velocities of the world, which leave a circle along its tangent, or of nothing."""
-    (step,) = poses_at([[0.05, 0, 0]], [0, 0.1, 0])
-    poses = [np.linalg.matrix_power(step, k) for k in range(4)]
+    start, step = poses_at([[1, 2, 3], [0.05, 0, 0]], [[0.3, -0.5, 0.2], [0, 0.1, 0]])
+    poses = [start @ np.linalg.matrix_power(step, k) for k in range(4)]
     models = ("previous_pose", "constant_velocity", "better_of_both")
     for model in models:
         np.testing.assert_array_equal(expected_poses(model, poses[:1]), poses[:1])
