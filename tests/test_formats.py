@@ -298,6 +298,9 @@ def test_a_lens_by_any_name(plain: Path) -> None:
         seen.append(read_sequence(plain).depths_mm)
     assert (seen[0] != seen[1]).any()
     assert all(np.array_equal(seen[1], depths) for depths in seen[2:])
+    change_camera(plain, tangential=[0, 0.1])
+    with pytest.raises(DataError, match=r"tangential is .*, which is not used"):
+        read_sequence(plain)
 
 
 @pytest.mark.parametrize("scale", [{"depth_scale": 4000}, {"scale": 4000.0}, {"scale": 0.00025}])
