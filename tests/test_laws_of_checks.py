@@ -7,11 +7,12 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 import pytest
+from box_room import poses_at, sequence_of
 
 from nbtrack.checks import findings
 from nbtrack.checks.conventions import Convention, _best_of
 from nbtrack.checks.misfits import Misfit, _normal_equations, _solution
-from nbtrack.checks.readings import Reading, cost_of, mean_apart
+from nbtrack.checks.readings import FramePairs, Reading, cost_of, mean_apart
 from nbtrack.core.camera import Intrinsics
 from nbtrack.recordings.formats import Declaration
 from nbtrack.recordings.recording import Recording
@@ -166,3 +167,50 @@ def test_a_step_of_a_fit_by_hand() -> None:
     np.testing.assert_allclose(H[:, 0, 1], (weights * slopes[0] * slopes[1]).sum(axis=1))
     assert cost_of(np.array([[0.004, np.nan, -0.012]])) == pytest.approx((0.5 + 0.9) / 2)
     assert mean_apart(np.array([[0.01, np.nan, -0.3]])) == pytest.approx((0.01 + 0.05) / 2)
+
+
+def wall_from(place_m: float, n_frames: int = 2) -> FramePairs:
+    """A wall 2 m ahead of the first frame, and seen 1.5 m away by the last one, whose pose says
+    that it is so far ahead of the first one."""
+    depths_mm = np.linspace(2000, 1500, n_frames)[:, None, None] * np.ones((48, 64))
+    poses = poses_at(np.outer(np.linspace(0, place_m, n_frames), [0, 0, 1]))
+    declared = Declaration(camera_axes="opencv")
+    recording = mock.Mock(spec=Recording, file_poses=poses, declared=declared)
+    sequence = sequence_of(depths_mm, READING.camera, poses=poses)
+    return FramePairs(recording, np.arange(n_frames), sequence, np.array([[0], [n_frames - 1]]))
+
+
+@pytest.mark.parametrize(
+    ("place_m", "changes", "residual_m", "depth_m"),
+    [
+        (0.5, {}, 0.0, 1.5), (0.53, {}, -0.03, 1.5), (0.3, {}, 0.2, 1.5),
+        (0.5, {"depth_share": 0.1}, 0.05, 1.65), (0.45, {"depth_offset": -0.1}, 0.05, 1.4),
+        (0.5, {"depth_error_per_m": 0.1}, 0.175, 1.725), (0.25, {"metres": (1, 1, 2)}, 0.0, 1.5),
+        (0.5, {"focal_share": 0.1, "aspect": 0.1}, 0.0, 1.5), (0.5, {"x": 0.3, "z": 0.2}, 0.0, 1.5),
+    ],
+)  # fmt: skip
+def test_how_far_apart_a_wall_lies_by_hand(place_m, changes, residual_m, depth_m) -> None:
+    """Catches a sign, an inverted pose, another unit or weight, and points beside the image."""
+    reading = replace(READING, **changes)
+    found = wall_from(place_m).compare(reading)
+    gap = residual_m / depth_m
+    gaps = found.area_gaps[np.isfinite(found.area_gaps)]
+    np.testing.assert_allclose(gaps, gap, atol=1e-4)
+    assert 8 <= len(gaps) < 24
+    assert found.apart == pytest.approx(min(abs(gap), 0.05), abs=1e-4)
+    assert found.depth_m == pytest.approx(depth_m, abs=1e-4)
+    nearer = (2 - place_m) / 2
+    if not changes:
+        assert found.overlap == pytest.approx(nearer**2, abs=0.05)
+    assert found.agreement == pytest.approx(found.overlap / (1 + (100 * gap) ** 2), rel=1e-2)
+
+
+def test_what_is_hidden_or_late() -> None:
+    """Catches points that count although a surface before them hides them; and depth that comes
+    before the poses, or is not interpolated: of 21 frames, each 2.5 cm ahead."""
+    assert wall_from(0.2).compare(READING).overlap == 0
+    long = wall_from(0.5, 21)
+    for late in (0.0, 1.0, 0.5):
+        # The first frame cannot be later: only the last one's pose is then too far ahead.
+        found = long.compare(replace(READING, late=late))
+        assert found.apart == pytest.approx(0.025 * late / 1.5, abs=1e-4)
