@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 import torch
 from box_room import BoxRoom, Formula, box_sequence, poses_at
-from scipy.spatial.transform import Rotation
 
 from nbtrack import Frame, Map, read_map, write_map
 from nbtrack.beyond.correction import CorrectedField, correct_map, corrected
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import corrected_vertices, regularisation_of, solve
 from nbtrack.beyond.lm import LmSettings, LmTracker
-from nbtrack.beyond.views import retrieve, spread_out, view_of
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, NeusMapping, make_field
 from nbtrack.machinery.errors import DataError
@@ -189,22 +187,13 @@ def test_a_room_that_was_never_mapped_is_told(found: CorrectedField) -> None:
         assert estimate.report["p_lost"] > 0.75
 
 
-def test_views_are_told_apart_and_spread(found: CorrectedField, sequence: RgbdSequence) -> None:
-    """Catches views of the wrong frame or unit, turns of the wrong sign, and poses that are kept by
-    time: a camera that stood still for most of a recording would fill them all."""
+def test_views_are_those_of_their_frames(found: CorrectedField, sequence: RgbdSequence) -> None:
+    """Catches views of the wrong frame or unit."""
     cameras = found.viewpoints.T_world_camera
     assert found.views.shape == (len(sequence), 2, 15, 20)
     ahead = sequence[2].depth_mm[45:51, 61:67].float().mean().item() / 50  # in units of 5 cm
     nearest = np.linalg.norm(cameras - sequence.T_world_camera[2], axis=(1, 2)).argmin()
     assert found.views[nearest, 1, 7, 9:11].float().mean().item() == pytest.approx(ahead, abs=1)
-    off = np.eye(4)
-    off[:3, :3] = Rotation.from_rotvec([0.0, 0.12, 0.0]).as_matrix()
-    turned = box_sequence((sequence.T_world_camera[2] @ off)[None], ROOM, 96)[0]
-    (guess,) = retrieve(view_of(turned), found.viewpoints, 1)
-    angle = Rotation.from_matrix(guess[:3, :3].T @ turned.T_world_camera[:3, :3]).magnitude()
-    assert angle < 0.06
-    still = np.concatenate([np.tile(np.eye(4), (500, 1, 1)), sequence.T_world_camera])
-    assert set(spread_out(still)[:12]) - {0} == set(range(501, 512))
 
 
 def test_colours_are_those_of_the_surface(found: CorrectedField, sequence: RgbdSequence) -> None:

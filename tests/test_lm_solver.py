@@ -19,7 +19,7 @@ from nbtrack.beyond.lm_solver import (
     robust_scales,
     try_step,
 )
-from nbtrack.beyond.observed import LUMA, Observed, draw_points, with_normals
+from nbtrack.beyond.observed import LUMA, Observed, draw_points
 from nbtrack.beyond.verdict import SIGMAS, std_when_moved
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.fields import NetworkSettings, make_field
@@ -222,19 +222,6 @@ def test_a_coarse_stage_that_leads_astray_is_undone() -> None:
     assert abs(optimizer.T_world_camera - ORIGIN).max() > 0.2
     optimizer.refine()
     np.testing.assert_array_equal(optimizer.T_world_camera, ORIGIN)
-
-
-def test_normals_of_planes() -> None:
-    """Catches a wrong sign, axis or focal length: planes that lean to a side, or overhead."""
-    frame = walk(1)[0]
-    y, x = torch.meshgrid(torch.arange(24) - 11.5, torch.arange(32) - 15.5, indexing="ij")
-    for normal in np.array([[0.6, 0.0, -0.8], [0.0, -0.6, -0.8]]):
-        depth = -48_000 / (normal[0] * x + normal[1] * y + normal[2] * 24)
-        frame.depth_mm[:] = depth.round().int()
-        observed = draw_points(frame, 300, torch.Generator())
-        assert abs(with_normals(frame, observed, 200)[2] - normal).max() < 0.02
-    frame.depth_mm[:, ::2] *= 2
-    assert not with_normals(frame, observed, 200)[2].any()  # each has an edge beside it
 
 
 def test_what_is_no_number_stays_none() -> None:
