@@ -94,8 +94,9 @@ def test_keys_change_with_what_matters(preset, scenes: list[Scene], monkeypatch)
     assert MapJob.of(scenes[0], "points", other).key == MapJob.of(scenes[0], "points", preset).key
     runs = [TrackJob(cells[0], scenes[0], "sdf", preset.tracking_of("sdf"), 2) for _ in range(2)]
     assert runs[0].key == runs[1].key
-    colored = TrackJob(cells[0], scenes[0], "sdf", other.tracking_of("sdf"), 2)
-    assert runs[0].key != colored.key
+    changes = [{"settings": other.tracking_of("sdf")}, {"steps": 3}, {"seed": 1}]
+    changes += [{"frames": ":3"}, {"start": "unknown"}]
+    assert len({run.key for run in [runs[0], *(replace(runs[0], **c) for c in changes)]}) == 6
     monkeypatch.setattr("nbtrack.provenance.versions", lambda: {"torch": "another"})
     assert MapJob.of(scenes[0], "neus", preset).key != cells[0].key
     assert replace(runs[0]).key != runs[1].key
