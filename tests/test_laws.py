@@ -159,16 +159,16 @@ def test_views_that_are_alike() -> None:
 def test_a_view_shows_what_lies_where() -> None:
     """Catches directions that are off by a column or a row or lie beside the picture, a principal
     point that is left out, and another unit of depth: of a plane that leans, in units of 5 cm."""
-    camera = Intrinsics(96, 72, 72.0, 72.0, 40.0, 42.0)
+    camera = Intrinsics(96, 72, 120.0, 110.0, 40.0, 33.0)
     rows, columns = np.indices((72, 96)) + 0.5
-    depths = 2000 / (1 - 0.9 * (columns - 40) / 72 - 0.6 * (rows - 42) / 72)
+    depths = 2000 / (1 - 0.9 * (columns - 40) / 120 - 0.6 * (rows - 33) / 110)
     depths[::2, ::2] = 0  # where nothing is measured nothing is averaged
     luma, depth = view_of(sequence_of(depths[None], camera)[0]).float().numpy()
     rows, columns = np.indices((15, 20))
     expected = 40 / (1 - 0.9 * 0.05 * (columns - 9.5) - 0.6 * 0.05 * (rows - 7))
-    u, v = 40 + 3.6 * (columns - 9.5), 42 + 3.6 * (rows - 7)  # where the picture has them
+    u, v = 40 + 6 * (columns - 9.5), 33 + 5.5 * (rows - 7)  # where the picture has them
     np.testing.assert_array_equal(luma > 0, (u > 0) & (u < 96) & (v > 0) & (v < 72))
-    asked = (luma > 0) & (expected < 60)
+    asked = (depth > 0) & (expected < 60)
     assert asked.sum() > 100
     assert np.abs(depth - expected)[asked].max() < 1.5
 
