@@ -4,15 +4,17 @@ import json
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from box_room import poses_at
 from scipy.spatial.transform import Rotation
 
 from nbtrack.beyond.verdict import score_detection
-from nbtrack.checks.in_map import other_world
+from nbtrack.checks.in_map import in_world_of_map, other_world
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import json_text, write_atomic
 from nbtrack.recordings.pose_files import read_tum, tum_text
+from nbtrack.tracking import Trajectory
 from nbtrack.tracking.metrics import align_rigidly, pose_errors, still_metrics, trajectory_metrics
 
 
@@ -93,6 +95,11 @@ def test_another_world_is_told_from_errors() -> None:
     estimated[:, :3, 3] += noise
     estimated[::3] = wandering(14, seed=9)  # lost frames do not change the world
     np.testing.assert_allclose(other_world(estimated, true), moved, atol=0.02)
+    tracked = Trajectory(estimated, true, pd.DataFrame({"translation_error_m": [9.0] * 40}))
+    found, is_other = in_world_of_map(tracked)
+    assert is_other
+    assert found.frames["translation_error_m"].median() < 0.05
+    assert tracked.frames["translation_error_m"].eq(9).all()  # the user's stays as it is
     drifting = true.copy()
     drifting[:, 0, 3] += np.linspace(0, 3, 40)
     assert other_world(drifting, true) is None
