@@ -110,7 +110,8 @@ class TrackJob(Job):
     def expected_reach(self) -> dict[str, float]:
         """The `reach_metrics` of the run, before it is made.
 
-        They are empty for a run by the clock, whose number of steps is not known in advance.
+        They are empty for a run by the clock, whose number of steps is not known in advance, and if
+        they cannot be computed.
         """
         if self.steps is not None:
             with contextlib.suppress(NbtrackError):  # the run will raise the error, too

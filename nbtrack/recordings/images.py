@@ -172,10 +172,9 @@ class Images:
             depth_mm *= 1 + declared.depth_error_per_m / 1000 * depth_mm
             if depth_mm.max() > _MAX_16_BITS:
                 found = f"{self.recording.depth_files[index]} holds {depth_mm.max() / 1000:.4g} m"
+                scale = f"{declared.depth_scale:g} depth values a metre"
                 limit = "at most 65.535 m can be kept; set depth_scale or no_depth in sequence.toml"
-                raise DataError(
-                    f"{found} with {declared.depth_scale:g} depth values a metre: {limit}"
-                )
+                raise DataError(f"{found} with {scale}: {limit}")
             depths_mm[place] = np.rint(depth_mm)
         return depths_mm
 
