@@ -25,6 +25,7 @@ _FRAMES_AT_ONCE = 32  # frames that are read at once; 50 MB at 640x480
 _POINTS_PER_FRAME = 3000  # about, in the cloud
 _N_PAIRS = 32  # pairs of frames that are compared
 _QUICK_PAIRS = 16  # pairs of frames that are compared in a quick look
+_ROUNDING = 1e-4  # share of the depth: smaller gaps, as of equal frames, leave nothing to explain
 _MIN_FRAMES = 30  # with fewer, pairs share too many frames to tell a small misfit
 _STRIDES = (5, 10, 20, 40)  # frames from one to the other of a pair, which still see the same
 _TURNED_DEG = 30  # a camera may turn so far within a pair: half of what most cameras see
@@ -115,7 +116,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     is_far = cloud.depth > far_limit(cloud.depth)
     # A small misfit can only be told if poses and depths are read rightly otherwise.
     declared_is_best = best is conventions[0]
-    has_enough = len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP
+    has_enough = len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
     causes = ProgressBar("fitting", CAUSES.items() if declared_is_best and has_enough else [])
     misfits = [fit(frame_pairs, as_declared, as_declared, name, keys) for name, keys in causes]
     main = main_misfits(frame_pairs, as_declared, misfits)
@@ -127,7 +128,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
         faults += findings.of_units(cloud.depth[~is_far])
         remarks += findings.of_depths(frames, cloud.depth, as_declared.declared.depth_scale)
     if not (faults or doubts):
-        doubts = list(findings.doubts_of_poses(conventions, recording.pose_file.name, is_whole))
+        doubts = list(findings.doubts_of_poses(conventions, recording, is_whole, frames))
     return DataReport(
         recording, frames, T_world_camera, cloud[~is_far], conventions=conventions, best=best,
         misfits=misfits, faults=faults, doubts=doubts, remarks=remarks,

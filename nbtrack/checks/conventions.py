@@ -153,9 +153,9 @@ def _hypotheses(as_declared: Reading) -> Iterator[tuple[str, str, Reading]]:
 def _best_of(conventions: list[Convention]) -> Convention:
     """The declared convention (the first), unless another one is clearly better.
 
-    Another one is better if clearly more points agree under it, or if its mean gap is three times
-    smaller. The gap is needed for positions that are mirrored along an axis along which the camera
-    hardly moved: most points agree with them, too.
+    Another one is better if its mean gap is three times smaller, or just smaller where clearly more
+    points agree under it. Points alone do not tell: with positions that are mirrored, along an axis
+    along which the camera hardly moved or that it looks along, most or more points agree, too.
 
     Only conventions are candidates whose surfaces meet and whose median depth is plausible for a
     depth camera. Depths and positions that are wrong by the same factor let surfaces meet as well,
@@ -168,8 +168,9 @@ def _best_of(conventions: list[Convention]) -> Convention:
     plausible = [c for c in meet if near <= c.depth_m <= far]
     highest = max((c.agreement for c in plausible), default=0.0)
     best = next((c for c in plausible if c.agreement >= _ALIKE * highest), declared)
-    is_nearer = best.apart < declared.apart / _NEARER
-    return best if best.is_clearly_better(declared) or is_nearer else declared
+    times = 1 if best.is_clearly_better(declared) else _NEARER
+    # The declared mean gap is NaN where no surfaces meet.
+    return declared if best.apart >= declared.apart / times else best
 
 
 def remedy(reading: Reading, as_declared: Reading) -> str:

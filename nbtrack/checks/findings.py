@@ -53,9 +53,9 @@ def misreading(declared: Convention, best: Convention, main: list[Misfit]) -> di
             f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
             "and nothing that is tried explains it: no other axes, units or directions of poses "
             "and depth, no late depth, no focal lengths or principal point, no error of depth (a "
-            "factor, a length, a square), no offset of the camera. What cannot be told: poses that "
-            "drift or jump, a lens's distortion, and depth images that hold no depth (disparity, "
-            "half floats, each frame scaled by itself)"
+            "factor up to 1.5, a length, a square), no offset of the camera. What cannot be told: "
+            "poses that drift, jump or have a scale of their own, a lens's distortion, and depth "
+            "images that hold no depth (disparity, half floats, each frame scaled by itself)"
         )
         return {"fault" if declared.is_far_apart else "doubt": [text]}
     else:
@@ -64,17 +64,22 @@ def misreading(declared: Convention, best: Convention, main: list[Misfit]) -> di
     return {kind: [f"{name}; {remedy(reading, declared.reading)} ({tail})"]}
 
 
-def doubts_of_poses(conventions: list[Convention], file: str, needs_proof: bool) -> Iterator[str]:
+def doubts_of_poses(
+    conventions: list[Convention], recording: Recording, needs_proof: bool, frames: pd.DataFrame
+) -> Iterator[str]:
     """A doubt if it cannot be told whether the poses are read rightly.
 
     The reason is that two frames see too little of the same, or, if `needs_proof`, that the camera
     moves too little to tell conventions apart. The declared one must come first in `conventions`.
+    `frames` is the table of `check`.
     """
     declared, *others = conventions
+    file, measured = recording.pose_file.name, frames.measured.mean()
     of_poses = [other for other in others if other.subject == "poses"]
     alike = [other.name for other in of_poses if not declared.is_clearly_better(other)]
     if declared.overlap < MIN_OVERLAP or np.isnan(declared.apart):
-        reason = f"two frames see too little of the same ({declared.overlap:.0%} of the points)"
+        reason = f"two frames see too little of the same ({declared.overlap:.0%} of the points, "
+        reason += f"whose neighbours need a depth, which {measured:.0%} of the pixels have)"
         yield f"{file} is not proved: {reason}: check it, and a piece with smaller steps"
     elif needs_proof and alike:
         reason = f"the camera moves too little to tell {len(alike)} other conventions apart"

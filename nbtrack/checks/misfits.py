@@ -149,7 +149,7 @@ def fit(
     values = np.array([getattr(start, key) for key in keys])
     gaps = gaps_at(values)
     for _ in range(_STEPS):
-        scale = _WIDE * float(np.nanmedian(np.abs(gaps)))
+        scale = max(1e-6, _WIDE * float(np.nanmedian(np.abs(gaps))))  # equal frames have no gaps
         H, g = _normal_equations(gaps, [gaps_at(values + move) for move in np.diag(unit)], scale)
         step = _solution(H.sum(axis=0), g.sum(axis=0))
         tried = [(values + factor * unit * step).clip(-limit, limit) for factor in _FACTORS]
