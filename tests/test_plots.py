@@ -240,6 +240,28 @@ def test_the_slice_has_the_projection_of_the_room(sequence, tmp_path) -> None:
     assert (tmp_path / "figure_1.pdf").read_bytes().startswith(b"%PDF")
 
 
+def test_poses_that_are_not_known_leave_gaps(sequence) -> None:
+    """Catches a path with an unknown pose, around which no slice and no top view can be drawn."""
+    T_true = sequence.T_world_camera.copy()
+    T_true[2] = np.nan
+    paths = {"tracked": sequence.T_world_camera, "true": T_true}
+    figure = plots.plot_map_and_slice(NEAR, sequence, paths, voxel=0.1)
+    (off_mm,) = figure.axes[2].lines
+    assert np.flatnonzero(np.isnan(off_mm.get_ydata())).tolist() == [2]
+    low = CLOUD - [0, 9, 0, 0, 0, 0]  # below the cameras
+    for of_run in (paths, {"true": T_true, "tracked": sequence.T_world_camera}):
+        (cloud,) = plots.plot_overview(low, of_run, None, "").axes[0].collections
+        assert len(cloud.get_offsets()) > 40  # all but the outermost
+    plots.plot_mesh({"room": room_mesh()}, paths)
+
+
+def test_a_notebook_shows_figures_whatever_their_files_are() -> None:
+    """Catches cells without figures where a user's matplotlib saves figures as SVG."""
+    with matplotlib.rc_context({"savefig.format": "svg"}):
+        picture = plots.plot_curves(SWEEP, "time (ms)", "ATE (cm)", "method")._repr_png_()
+    assert picture.startswith(b"\x89PNG")
+
+
 def test_steps_begin_at_their_start(sequence) -> None:
     """Catches a path of steps in the world's axes, in another unit, also in its title, or without
     its first pose."""

@@ -1,4 +1,4 @@
-"""Figures of the paper's story: drawing only, from data already computed.
+"""Figures. They only draw data that are already computed.
 
 Every function returns a figure that a notebook shows once, with axes labelled in units, the
 paper's method names, and a title that states the finding.

@@ -1,4 +1,4 @@
-"""What a camera saw beside what a field renders; numbers as curves and bars."""
+"""Figures of images, measured and rendered, and figures of numbers as curves and points."""
 
 from collections.abc import Mapping, Sequence
 from itertools import chain, cycle
@@ -19,25 +19,27 @@ from nbtrack.tables import STANDING_STILL
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 DEPTH, DEPTH_ERROR, DISTANCE = "depth (m)", "depth error (cm)", "|signed distance| (cm)"
-# Panels keep their own anchor (panchor): else those with a bar stand lower than those without.
+# With `panchor` a colour bar does not change its panels' anchor: else panels with a bar would stand
+# lower than those without.
 _BAR = {"location": "bottom", "pad": 0.02, "extend": "max", "panchor": False}
 _MARKS = "os^Dv"  # matplotlib's markers of up to five methods
-# A title, an image (colours or numbers), and the label of the numbers' colour bar; "" for colours.
+# A title, an image, and the label of its colour bar. The label is "" for a colour image.
 Panel = tuple[str, np.ndarray, str]
-Curves = Mapping[str, Values]  # numbers by label
-Ends = Mapping[str, float]  # of colour scales, by label
+Curves = Mapping[str, Values]  # the numbers of each curve, by its label
+Ends = Mapping[str, float]  # the upper ends of colour scales, by the labels of their bars
 
 
 @style.styled
 def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figure:
-    """Colour and depth (m) of the frame at a position of a sequence; unmeasured pixels are grey.
+    """The colour and depth (m) images of the frame at an index; unmeasured pixels are grey.
 
-    With a slider, where `fixed` is that of ipywidgets: `interact(plot_frame,
+    With ipywidgets, this call lets a slider choose the frame: `interact(plot_frame,
     sequence=fixed(sequence), index=(0, len(sequence) - 1), title=fixed("A room"))`.
     """
-    # One scale for all frames, from a sixteenth of the pixels of at most 20 of them.
+    # All frames of a sequence share one depth scale. It is computed from every 16th pixel of at
+    # most 20 frames.
     some_mm = sequence.depths_mm[:: 1 + len(sequence) // 20, ::4, ::4]
-    far = MILLIMETRE * _most(np.ma.masked_equal(some_mm, 0), DEPTH)
+    far = MILLIMETRE * _scale_end(np.ma.masked_equal(some_mm, 0), DEPTH)
     depth = np.ma.masked_equal(sequence.depth(index), 0)  # 0 is an unmeasured pixel
     color = (f"frame {sequence.frame_ids[index]}: colour", sequence.color(index), "")
     return plot_images([[color, ("depth", depth, DEPTH)]], title, {DEPTH: far})
@@ -47,10 +49,11 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
 def plot_views(
     sequence: RgbdSequence, indices: Sequence[int], views: Sequence[View], title: str = ""
 ) -> Figure:
-    """Observed and rendered colour and depth of some frames, one a row; unmeasured pixels grey.
+    """A row for each of some frames: measured and rendered colour and depth, and the depth error.
 
-    Depths (m) share one colour scale; that of errors ends at 10 cm in every figure. `indices` are
-    positions in the sequence, `views` what the field renders from the same poses.
+    `indices` are those of the frames in the sequence; `views` are what the field renders from their
+    poses. Depths (m) share one colour scale. The scale of errors ends at 10 cm in every figure.
+    Unmeasured pixels are grey.
     """
     rows = []
     for index, (color, rendered) in zip(indices, views, strict=True):
@@ -64,14 +67,15 @@ def plot_views(
 
 @style.styled
 def plot_distances(frame: Frame, distances: Curves, title: str = "") -> Figure:
-    """A frame's colour, and by label |d| (cm) of its points in a map; unmeasured pixels are grey.
+    """A frame's colour image, and an image of |d| (cm) for each label; unmeasured pixels are grey.
 
-    `distances` (m) of a label are those at the pixels of `frame.measured_pixels()`, in their order.
+    `distances` maps labels to the signed distances d (m) of a map at the frame's measured points,
+    in the order of `frame.measured_pixels()`.
     """
     rows, columns = frame.measured_pixels().cpu().numpy()
     panels = [("observed colour", frame.color.cpu().numpy(), "")]
     for label, sdf in distances.items():
-        # `masked_all` leaves its memory as it is, of which drawing may warn.
+        # Zeros, since `np.ma.masked_all` has arbitrary values, of which drawing may warn.
         image_cm = np.ma.array(np.zeros(frame.depth_mm.shape), mask=True)
         image_cm[rows, columns] = 100 * sdf.abs().cpu().numpy()
         panels.append((f"{label}: mean {image_cm.mean():.2f} cm", image_cm, DISTANCE))
@@ -80,45 +84,46 @@ def plot_distances(frame: Frame, distances: Curves, title: str = "") -> Figure:
 
 @style.styled
 def plot_images(rows: list[list[Panel]], title: str = "", ends: Ends | None = None) -> Figure:
-    """Images in rows, each with a title and the label of its colour bar, "" for colours.
+    """Rows of images, each with a title above it; numbers have a colour bar below them.
 
-    Images of one label share a bar, and a scale from 0 to its end in `ends`, by default to the 98 %
-    quantile of their values, of depths to the 99.9 % quantile.
+    Images with the same label share one colour bar, whose scale begins at 0. It ends at the label's
+    value in `ends`, or by default at a high quantile of all values with the label.
     """
     _, first, _ = rows[0][0]
     height, width = first.shape[:2]
-    # The figure's title and bars, and in each row the panels' titles and images.
+    # The figure's title and colour bars, and in each row the titles and the images.
     inches = 0.75 + len(rows) * (0.2 + style.WIDTH / len(rows[0]) * height / width)
     grid = style.new_axes(title, inches, len(rows), len(rows[0]))
-    with_bar: dict[str, list[AxesImage]] = {}
+    images_of: dict[str, list[AxesImage]] = {}  # by the label of their colour bar
     for axes, (name, image, label) in zip(grid.flat, chain(*rows), strict=True):
         drawn = show_image(axes, image, name, "viridis" if label == DEPTH else "magma")
         if label:
-            with_bar.setdefault(label, []).append(drawn)
+            images_of.setdefault(label, []).append(drawn)
     figure = grid[0, 0].figure
-    for label, images in with_bar.items():
+    for label, images in images_of.items():
         values = np.ma.stack([drawn.get_array() for drawn in images])
-        limit = (ends or {}).get(label) or _most(values, label)
+        end = (ends or {}).get(label) or _scale_end(values, label)
         for drawn in images:
-            drawn.set_clim(0, limit)
-        # Wide bars are no thicker than narrow ones, whose length is some tens of their thickness.
+            drawn.set_clim(0, end)
+        # All bars are equally thick. One below all columns is 90 times as long as it is thick.
         aspect = 90 * min(len(images), len(rows[0])) / len(rows[0])
-        figure.colorbar(images[0], ax=[i.axes for i in images], label=label, aspect=aspect, **_BAR)
+        panels = [drawn.axes for drawn in images]
+        figure.colorbar(images[0], ax=panels, label=label, aspect=aspect, **_BAR)
     return figure
 
 
-def _most(images: np.ndarray, label: str) -> float:
-    """A quantile of known values, so that a few wild pixels do not hide the rest.
+def _scale_end(images: np.ndarray, label: str) -> float:
+    """The end of a colour scale: a quantile of the values that are not masked, or 1 without any.
 
-    Of errors it is that of 98 %; the farthest depths are walls, and that of 99.9 % shows them, too.
-    It is 1 where nothing is known: a scale needs an end.
+    With a quantile, a few very large values do not make all others look alike. It is the 98 %
+    quantile, but the 99.9 % quantile of depths, whose largest values are distant walls.
     """
     values = np.ma.compressed(images)
     return float(np.quantile(values, 0.999 if label == DEPTH else 0.98)) if len(values) else 1.0
 
 
 def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis") -> AxesImage:
-    """An image without ticks, grid and frame; masked pixels are grey. `colors` names a colormap."""
+    """Draw an image without ticks and frame; masked pixels are grey. `colors` names a colormap."""
     axes.set_title(title)
     axes.set_axis_off()
     return axes.imshow(image, cmap=matplotlib.colormaps[colors].with_extremes(bad="#bdbdbd"))
@@ -128,13 +133,13 @@ def show_image(axes: Axes, image: np.ndarray, title: str, colors: str = "viridis
 def plot_along_ray(
     depths: Values, curves: Curves, marks: Mapping[str, float], title: str, ylabel: str
 ) -> Figure:
-    """Curves of one unit over the z-depths (m) of a ray's samples; that called "true" is dashed.
+    """Curves over the z-depths (m) of a ray's samples, and vertical lines at the depths of `marks`.
 
-    A curve may be shorter than `depths`: weights of sections lack the last sample. `marks` are
-    further depths (m) by label.
+    A curve may be shorter than `depths`, as weights of sections, which have one value less. The
+    curve labelled "true" is dashed. `marks` are depths (m) by label.
     """
     index = depths.cpu().numpy()
-    columns = {k: pd.Series(c.detach().cpu(), index[: len(c)]) for k, c in curves.items()}
+    columns = {label: pd.Series(c.detach().cpu(), index[: len(c)]) for label, c in curves.items()}
     axes = style.new_axes(title, 2.7)[0, 0]
     dashes = ["--" if label == "true" else "-" for label in columns]
     look = {"style": dashes, "color": style.method_colors(columns)}
@@ -147,12 +152,12 @@ def plot_along_ray(
 
 @style.styled
 def plot_columns(tables: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
-    """A panel for each column of each table: a row for each column, a panel column for each table.
+    """Every column of every table as a curve in a panel of its own.
 
-    The name of a table stands above its panels. Tables have the same columns, whose names, with
-    units, label y; the name of the index labels x.
+    Tables stand side by side below their names. They have the same columns, which stand one below
+    the other: names of columns, with units, label y. The name of the index labels x.
     """
-    n_rows = len(next(iter(tables.values())).columns)
+    n_rows = max(len(table.columns) for table in tables.values())
     height = 0.9 + 1.45 * n_rows  # inches
     grid = style.new_axes(title, height, n_rows, len(tables), sharex="col", sharey="row")
     for column, (heading, table) in zip(grid.T, tables.items(), strict=True):
@@ -168,9 +173,10 @@ def plot_columns(tables: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
 def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Errors of every frame: position (cm, logarithmic) and orientation (degrees).
 
-    `frames` has by method the rows of a run's frames.csv, of the same frames. The dashed line is
-    the ATE of 0.2 m above which the paper prints a sequence in red; the dotted one is a camera that
-    stands still. The legend names these two, since curves have their names at their ends.
+    `frames` maps methods to the rows of their runs' frames.csv, all of the same frames. The dashed
+    line is the ATE of 0.2 m above which the paper prints a sequence in red; the dotted one is the
+    error of a camera that stands still. The legend explains both lines. Curves have their names at
+    their ends.
     """
     above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
     draw_errors(above, frames)
@@ -183,17 +189,18 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
 
 
 def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
-    """Errors of the position (cm) by frame and label, and those of a camera standing still.
+    """Draw the position errors (cm) of runs by frame, and those of a camera that stands still.
 
-    Of several curves each has its label at its end; one curve alone has it in the legend.
+    `frames` are as in `plot_errors`. Several curves have their labels at their ends; a single one
+    has its label in the legend.
     """
-    alone = len(frames) == 1
+    is_alone = len(frames) == 1
     for label, color in style.method_colors(frames).items():
         error_cm = 100 * frames[label]["translation_error_m"]
         index = frames[label]["frame_id"]
-        axes.plot(index, error_cm, color=color, label=label if alone else "")
+        axes.plot(index, error_cm, color=color, label=label if is_alone else "")
         last = error_cm.last_valid_index()
-        if last is not None and not alone:
+        if last is not None and not is_alone:
             end = index[last], error_cm[last]
             axes.annotate(label, end, (5, 0), textcoords="offset points", color=color, va="center")
     still = list(frames.values())[-1]  # the same in every run of these frames
@@ -211,11 +218,12 @@ def plot_panels(
     same_x: bool = False,
     joined: bool = True,
 ) -> Figure:
-    """A panel for each table, by its title: a column is a method, whose numbers are points along x.
+    """Tables as panels below their titles: each number is a point on x, in the row of its index.
 
-    Tables share the texts of their index, which stand along y from the top; in a table each has one
-    row, whose numbers a pale line joins, if they are to be `joined`. x is logarithmic, labelled by
-    `x`, and with `same_x` of one range in all panels.
+    Each column is a method with its own colour and mark. All panels have the same rows, from top to
+    bottom: the texts in the tables' indices, each at most once in a table. If `joined`, a pale line
+    connects the points of a row. x is logarithmic and labelled by `x`; with `same_x` it has the
+    same range in all panels.
     """
     texts = pd.Index(np.concatenate([table.index for table in panels.values()])).unique()
     grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
@@ -236,14 +244,14 @@ def plot_panels(
 def plot_curves(
     table: pd.DataFrame, x: str, y: str, by: str, title: str = "", log: str = "xy", line: str = "-"
 ) -> Figure:
-    """Column `y` over column `x`, a line for each group of rows with the same value of `by`.
+    """Column `y` over column `x`: a curve for each group of rows with the same value of `by`.
 
-    Groups of one row are points beside their labels. Axes are labelled by the names of the columns,
-    as "time a frame (ms)". If x is text, it keeps the order of its first appearance, and points of
-    the groups stand side by side, without lines. A method has its own colour; marks tell groups
-    apart, too, and a variant, named after a comma, is dashed. Columns `from` and `to` are drawn as
-    intervals of y. `log` names the logarithmic axes; `line` is matplotlib's style of all lines, and
-    "none" leaves points.
+    If every group has a single row, the rows are points beside their labels. The names of the
+    columns label the axes. If `x` holds texts, these keep the order of their first appearance, and
+    points of different groups stand side by side without lines. A variant of a method, which is
+    named after a comma, is dashed. If the table has columns `from` and `to`, they are drawn as
+    intervals of y. `log` names the logarithmic axes; `line` is matplotlib's style of all lines,
+    where "none" means points only.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
     is_text = not pd.api.types.is_numeric_dtype(table[x])
@@ -266,12 +274,14 @@ def plot_curves(
 
 
 def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray:
-    """Make texts the ticks of x; returns where each point lies on x.
+    """Make the different texts ticks at 0, 1, 2, ... on x; returns the x of each point.
 
-    Points of a text are shifted by the group that their label names: groups share half the distance
-    of two ticks, and fewer than four stand as close as four.
+    A point lies near the tick of its text. So that points of different labels stand side by side,
+    each label has its own shift from the tick. With four labels or more the shifts span half of the
+    distance between two ticks; fewer labels stand as close together as four.
     """
-    codes, ticks = pd.factorize(texts)
+    tick_of_point, ticks = pd.factorize(texts)
     axes.set_xticks(range(len(ticks)), ticks)
-    groups, names = pd.factorize(labels)
-    return codes + (groups - (len(names) - 1) / 2) * 0.5 / max(len(names), 4)
+    label_of_point, names = pd.factorize(labels)
+    from_middle = label_of_point - (len(names) - 1) / 2  # in places beside each other
+    return tick_of_point + from_middle * 0.5 / max(len(names), 4)

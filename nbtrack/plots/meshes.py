@@ -1,4 +1,4 @@
-"""Surfaces of maps as coloured meshes, and which part of them was seen."""
+"""Surfaces of maps as coloured meshes, the part of them that was seen, and files of meshes."""
 
 import numpy as np
 import torch
@@ -24,21 +24,20 @@ def extract_mesh(
     frames: Frames | None = None,
     voxel: float = 0.05,
 ) -> Mesh:
-    """Coloured mesh (m, world frame) of a field's surface, by marching cubes; points as they are.
+    """The coloured mesh (m, world frame) of a field's surface, by marching cubes.
 
-    A field has a value everywhere, also where no camera looked. With a sequence, a face is kept
-    only if each of its corners was seen in a frame of it, or in one of `frames` if they are given.
-
-    The grid's cells have an edge of `voxel` metres. A `PointCloud` has no surface: it is returned
-    with its colours. Raises DataError where there is no surface.
+    The cells of the grid have an edge of `voxel` metres. A field has values even where no camera
+    has looked. With a sequence only faces are kept whose corners were all seen by its frames, or by
+    those with the indices `frames`. A `PointCloud`, which has no surface, is returned as points.
+    Raises DataError if there is no surface, or none was seen.
     """
     if isinstance(field, PointCloud):
         colors = (255 * field.colors).round().byte()
         return trimesh.PointCloud(field.points.cpu().numpy(), colors.cpu().numpy())
     low, high = np.array([field.bounds.minimum, field.bounds.maximum])
     x, y, z = [np.arange(a, b + voxel, voxel) for a, b in zip(low, high, strict=True)]
-    # One at a time: all points of a large place are gigabytes.
-    layers = (np.stack(np.meshgrid(place, y, z, indexing="ij"), axis=-1) for place in x)
+    # A generator of layers of the grid: all points of a large room would be gigabytes.
+    layers = (np.stack(np.meshgrid(x_layer, y, z, indexing="ij"), axis=-1) for x_layer in x)
     values = np.concatenate([query_field(field, layer)[1] for layer in layers])
     if not values.min() < field.surface_level < values.max():
         span = f"[{values.min():.3g}, {values.max():.3g}]"
@@ -57,7 +56,7 @@ def extract_mesh(
 
 
 class ExactDistance(Field):
-    """The exact distance (m) of a room as a field: its colour is grey, its bounds are the map's."""
+    """The exact distance (m) of a room as a field, with the bounds of a map and a grey colour."""
 
     name, label, surface_level = "exact", "Exact distance", 0.0
 
@@ -74,47 +73,65 @@ class ExactDistance(Field):
 def exact_mesh(
     room: Room, mapped: Field, sequence: RgbdSequence, voxel: float = 0.05
 ) -> trimesh.Trimesh:
-    """The mesh (m, world frame) of a room within a map's bounds, in the colours that cameras see.
+    """The mesh (m, world frame) of a room's exact surface within a map's bounds, coloured.
 
-    As that of the map by `extract_mesh`, it has what the frames of the sequence have seen.
+    Like the mesh of the map, it has only what the frames of the sequence have seen.
     """
     mesh = extract_mesh(ExactDistance(room, mapped), sequence, voxel=voxel)
+    # The colour of a vertex is what a short ray sees that hits the surface there from free space.
+    # Normals may point to either side; the sign is 1 where they point to free space, else -1.
     step = 0.5 * voxel * mesh.vertex_normals
-    outwards = np.sign(room.sdf(mesh.vertices + step) - room.sdf(mesh.vertices - step))[:, None]
-    _, colors, _ = room.cast(mesh.vertices + outwards * step, -outwards * step)
+    sign = np.sign(room.sdf(mesh.vertices + step) - room.sdf(mesh.vertices - step))[:, None]
+    _, colors, _ = room.cast(mesh.vertices + sign * step, -sign * step)
     mesh.visual.vertex_colors = (255 * colors).round().astype(np.uint8)
     return mesh
 
 
 def mesh_bytes(mesh: Mesh, kind: str, origin: Position, up: Position | None = None) -> bytes:
-    """A mesh as a file, "ply" or "glb", in the world of the recording: moved by its origin (m).
+    """The content of a PLY or GLB file (`kind`) of a mesh, in the world frame of its recording.
 
-    In GLB y is up and colours are linear. `up` is the world's axis that is up (None: y); it is
-    turned there. In PLY the axes stay, and colours are sRGB, as those of images.
-
-    With an origin of millions of metres, as in the coordinates of geographic maps, single precision
-    resolves decimetres only. So a moved PLY file has double precision; a GLB file, which knows
-    none, holds the unmoved mesh and by how much its node is turned and moved.
+    `origin` (m) is the position of the mesh's world origin in that frame. `up` is the axis of the
+    world that points up (a unit vector; None: y): a GLB file is turned, since its y points up by
+    convention. A PLY file keeps the axes.
     """
     if kind == "glb":
-        up = np.array([0.0, 1, 0] if up is None else up)
-        side = np.array([0.0, 0, 1] if up[0] else [1.0, 0, 0])
-        T = np.eye(4)
-        T[:3, :3] = side, up, np.cross(side, up)
-        T[:3, 3] = T[:3, :3] @ origin
-        colors = np.array(mesh.visual.vertex_colors)
-        srgb = colors[:, :3] / 255
-        linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-        colors[:, :3] = (255 * linear).round()  # IEC 61966-2-1
-        mesh = mesh.copy()
-        mesh.visual.vertex_colors = colors
-        scene = trimesh.Scene()
-        scene.add_geometry(mesh, transform=T)
-        return scene.export(file_type=kind)
-    content = mesh.export(file_type=kind, vertex_normal=False)
+        return _glb_bytes(mesh, origin, np.array([0.0, 1, 0] if up is None else up))
+    return _ply_bytes(mesh, origin)
+
+
+def _glb_bytes(mesh: Mesh, origin: Position, up: Position) -> bytes:
+    """A GLB file of a mesh, with linear colours, as GLB asks for.
+
+    GLB has single precision only, which resolves decimetres at an origin of millions of metres. So
+    the mesh stays as it is, and the transform of its node turns and moves it.
+    """
+    # The rows of the rotation are the file's axes x, y and z in the world: a horizontal axis, up,
+    # and the axis that completes a right-handed frame.
+    horizontal = np.array([0.0, 0, 1] if up[0] else [1.0, 0, 0])
+    T_file_mesh = np.eye(4)
+    T_file_mesh[:3, :3] = horizontal, up, np.cross(horizontal, up)
+    T_file_mesh[:3, 3] = T_file_mesh[:3, :3] @ origin
+    colors = np.array(mesh.visual.vertex_colors)
+    srgb = colors[:, :3] / 255
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    colors[:, :3] = (255 * linear).round()  # IEC 61966-2-1
+    mesh = mesh.copy()
+    mesh.visual.vertex_colors = colors
+    scene = trimesh.Scene()
+    scene.add_geometry(mesh, transform=T_file_mesh)
+    return scene.export(file_type="glb")
+
+
+def _ply_bytes(mesh: Mesh, origin: Position) -> bytes:
+    """A PLY file of a mesh that is moved by `origin` (m), with sRGB colours, as those of images.
+
+    A moved mesh has double precision: single precision resolves decimetres at an origin of millions
+    of metres, as geographic coordinates have.
+    """
+    content = mesh.export(file_type="ply", vertex_normal=False)
     if not origin.any():
         return content
-    # The vertices, which are the first part of the body, are replaced.
+    # trimesh writes single precision. Its vertices, the first part of the body, are replaced.
     head, end, body = content.partition(b"end_header\n")
     single = np.dtype([("xyz", "<f4", 3), ("rgba", "u1", 4)])
     double = np.dtype([("xyz", "<f8", 3), ("rgba", "u1", 4)])
@@ -126,7 +143,7 @@ def mesh_bytes(mesh: Mesh, kind: str, origin: Position, up: Position | None = No
 
 @torch.no_grad()
 def query_field(field: Field, points_world: GridPoints) -> tuple[np.ndarray, np.ndarray]:
-    """Colours (*shape, 3) and values (*shape,) at points, some at a time to bound the memory."""
+    """Colours (*shape, 3) and values (*shape,) of a field at points, in batches to bound memory."""
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     answers = [field(part.to(field.device)) for part in points.split(_POINTS_AT_ONCE)]
     colors, values = (torch.cat(parts).cpu().numpy() for parts in zip(*answers, strict=True))
@@ -136,9 +153,9 @@ def query_field(field: Field, points_world: GridPoints) -> tuple[np.ndarray, np.
 def seen_by(
     points_world: GridPoints, sequence: RgbdSequence, frames: Frames | None = None
 ) -> Bool[np.ndarray, "*shape"]:
-    """Whether points (m) were seen: in view of a frame, at most 0.1 m behind what it measured.
+    """Whether each point (m) was seen: in view of a frame, at most 0.1 m behind what it measured.
 
-    `frames` are indices in the sequence, by default all; see `min_depth_behind`.
+    `frames` are indices in the sequence, by default all; every fifth of them is used.
     """
     points = torch.from_numpy(np.ascontiguousarray(points_world, np.float32)).view(-1, 3)
     frames = np.arange(len(sequence)) if frames is None else frames

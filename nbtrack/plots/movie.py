@@ -1,6 +1,6 @@
-"""A tracked run as a moving picture, or as a recording of the Rerun viewer.
+"""A tracked run as an animated GIF, or as a recording for the Rerun viewer.
 
-Both show what was observed, what the map shows there, and the path.
+Both show the observed images, the map and the path; the GIF shows the map from the estimated pose.
 """
 
 import io
@@ -22,9 +22,9 @@ from nbtrack.plots.scene import draw_cloud
 from nbtrack.plots.style import new_axes, styled
 from nbtrack.tracking import Trajectory
 
-_WIDTH = 240  # pixels of the map's view
+_WIDTH = 240  # pixels of the view of the map
 _NEAR = 0.1  # m; nearer surfaces are not drawn
-# The corners (m) of what is drawn for a point, which faces the camera.
+# The corners (m) of the square that is drawn for a point. It faces the camera.
 _SQUARE = 0.02 * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 
 
@@ -36,16 +36,16 @@ def movie_pictures(
     title: str,
     progress: Callable[[int], object] = lambda done: None,
 ) -> Iterator[Image.Image]:
-    """A picture for each frame of a run, drawn when it is asked for.
+    """Yields a picture for each frame of a run, drawn when it is asked for.
 
-    On the left is the observed image, in the middle the map's surface as seen from the estimated
-    pose, on the right the estimated path up to there, from above. `run` has the sequence's rows of
-    frames.csv,
-    `T_estimated` their camera-to-world poses (m). `progress` is told how many are drawn.
+    It shows the observed image on the left, the map's surface from the estimated pose in the
+    middle, and the estimated path up to this frame from above on the right. `run` has a row of
+    frames.csv for each frame of the sequence; `T_estimated` are their camera-to-world poses (m).
+    `progress` is told the number of pictures drawn.
     """
     left, middle, right = new_axes(title, 2.8, 1, 3, width_ratios=[1, 1, 0.9])[0]
     page = draw_cloud(right, cloud_of(surface), {"tracked": T_estimated})
-    path, dot = right.lines  # the dot stood at the start, and now moves along the path
+    path, dot = right.lines  # the dot was drawn at the start; here it moves along the path
     dot.set_color(path.get_color())
     label = right.text(0, 1.03, "", transform=right.transAxes)
     canvas = FigureCanvasAgg(left.figure)
@@ -63,17 +63,17 @@ def movie_pictures(
         error = "" if np.isnan(error_cm) else f", off by {error_cm:.1f} cm"
         label.set_text(f"frame {row.frame_id}{error}")
         canvas.draw()
-        left.figure.set_layout_engine("none")  # the first picture's layout stays: nothing jumps
+        left.figure.set_layout_engine("none")  # keeps the layout of the first picture
         progress(index + 1)
-        # A GIF holds at most 256 colours a picture; 64 keep it small.
+        # A picture in a GIF has at most 256 colours; 64 keep the file small.
         yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(64)
 
 
 @styled
 def movie_bytes(pictures: Iterator[Image.Image]) -> bytes:
-    """A GIF that repeats, of at least one picture.
+    """The content of a GIF that repeats; there must be at least one picture.
 
-    `movie_pictures` draws each picture when this asks for it, and so in the house style.
+    `movie_pictures` draws each picture when this function asks for it, and so in the house style.
     """
     content = io.BytesIO()
     options = {"duration": 100, "loop": 0, "optimize": True}  # ms a picture
@@ -82,11 +82,11 @@ def movie_bytes(pictures: Iterator[Image.Image]) -> bytes:
 
 
 def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarray:
-    """The surface (m, world frame) as a camera sees it, (height, width, 3; uint8); white elsewhere.
+    """An image (height, `_WIDTH`, 3; uint8) of a surface (m, world frame) from a camera pose.
 
-    The picture is `_WIDTH` pixels wide. Faces, and squares in place of points, are painted from the
-    farthest to the nearest. Faces that show their back are painted too: a density and a distance
-    differ in the side that marching cubes makes the front.
+    Faces, and squares in place of points, are painted from the farthest to the nearest on white.
+    Faces that show their back are painted, too, since marching cubes gives densities and distances
+    opposite fronts.
     """
     scale = _WIDTH / camera.width
     height = round(scale * camera.height)
@@ -94,11 +94,11 @@ def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarr
     is_cloud = isinstance(surface, trimesh.PointCloud)
     parts = np.arange(len(points_camera))[:, None] if is_cloud else surface.faces
     corners = points_camera[parts] + (_SQUARE if is_cloud else 0)
-    depth = np.maximum(corners[..., 2:], _NEAR)  # no division by zero; what is nearer is left out
+    depth = np.maximum(corners[..., 2:], _NEAR)  # avoids a division by 0 in parts left out below
     pixels = scale * (corners[..., :2] / depth * [camera.fx, camera.fy] + [camera.cx, camera.cy])
     in_view = ((pixels.max(axis=1) > 0) & (pixels.min(axis=1) < [_WIDTH, height])).all(axis=1)
     seen = np.flatnonzero(in_view & (corners[..., 2] > _NEAR).all(axis=1))
-    order = seen[np.argsort(-corners[seen, :, 2].mean(axis=1))]  # the farthest first
+    order = seen[np.argsort(-corners[seen, :, 2].mean(axis=1))]  # from the farthest to the nearest
     colors = surface.visual.vertex_colors[parts[order], :3].mean(axis=1)
     image = np.full((height, _WIDTH, 3), 255, np.uint8)
     for polygon, color in zip(pixels[order].round().astype(np.int32), colors.tolist(), strict=True):
@@ -114,15 +114,15 @@ def cloud_of(surface: Mesh) -> pd.DataFrame:
 
 
 def rerun_bytes(surface: Mesh, seen: RgbdSequence, run: Trajectory, title: str) -> bytes:
-    """An `.rrd` file of a map's surface, and of a run's paths, frames, errors and verdicts.
+    """The content of an `.rrd` file: a map's surface, and a run's paths, frames, errors, verdicts.
 
-    All are relative to the run's origin, by which the file moves them into the recording's world:
-    the viewer's numbers have single precision.
+    `seen` holds some of the run's frames with their estimated poses (m). In the viewer, frame
+    numbers and seconds are time lines; errors (m) and verdicts (1: lost) are curves.
 
-    `seen` has some of the run's frames, at the poses (m) where the camera was estimated to be. In
-    the viewer frames and seconds are time lines, and errors (m) and verdicts (1: lost) are curves.
+    The viewer has single precision. So all positions are stored relative to the run's origin, and a
+    transform moves them into the recording's world.
     """
-    import rerun as rr  # an extra, and slow to load
+    import rerun as rr  # an optional package, which is slow to load
 
     recording = rr.RecordingStream(f"nbtrack: {title}")
     stream = recording.binary_stream()
@@ -143,12 +143,12 @@ def rerun_bytes(surface: Mesh, seen: RgbdSequence, run: Trajectory, title: str) 
     for row in run.frames.itertuples():
         recording.set_time("frame", sequence=row.frame_id)
         recording.set_time("seconds", duration=row.time)
-        for i in np.flatnonzero(seen.frame_ids == row.frame_id):  # one or none
+        for i in np.flatnonzero(seen.frame_ids == row.frame_id):  # one frame, or none
             T = seen.T_world_camera[i]
             recording.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
             recording.log("world/camera/color", rr.Image(seen.colors[i]).compress())
             recording.log("world/camera/depth", rr.DepthImage(seen.depths_mm[i], meter=1000))
         recording.log("error_m", rr.Scalars(row.translation_error_m))
-        # Of a tracker that does not judge itself, frames without depth are the lost ones.
+        # If the tracker does not judge its estimates, frames without depth count as lost.
         recording.log("lost", rr.Scalars(float(getattr(row, "lost", row.without_depth))))
     return stream.read()

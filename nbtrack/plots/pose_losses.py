@@ -1,4 +1,4 @@
-"""Both trackers' losses of one frame around its true pose, to look at and to play with."""
+"""Figures of both trackers' losses around a frame's true pose, and of the steps of trackers."""
 
 from collections.abc import Mapping
 
@@ -24,7 +24,7 @@ _COLORS = dict(zip((_SDF_LOSS, _VR_LOSS), method_colors(["SDF", "VR"]).values(),
 
 
 def move_sideways(frame: Frame, x_cm: float, y_deg: float) -> Transform:
-    """The true camera-to-world pose (m), moved along the camera's x and turned about its y."""
+    """The true camera-to-world pose (m), moved along the camera's x axis and turned about its y."""
     T_camera_moved = trimesh.transformations.rotation_matrix(np.radians(y_deg), [0, 1, 0])
     T_camera_moved[0, 3] = x_cm / 100
     return torch.from_numpy(frame.T_world_camera @ T_camera_moved).float()
@@ -34,20 +34,22 @@ def move_sideways(frame: Frame, x_cm: float, y_deg: float) -> Transform:
 def pose_losses(
     density: LearnedField, distance: Field, frame: Frame, y_deg: float = 0.0
 ) -> pd.DataFrame:
-    """Losses of the same pixels, with the camera moved along its x (index, cm) and turned about y.
+    """Losses of both trackers for a frame, over offsets of the camera from its true pose.
 
-    SDF's loss is that of its tracker in the map `distance`, VR's in the map `density`, with default
-    settings and nothing random. The third column is the mean density at the observed points.
+    The camera is moved along its x axis (the index, in cm) and turned about its y axis by `y_deg`.
+    The columns are SDF's loss in the map `distance`, VR's loss in the map `density`, and the mean
+    density at the measured points. Losses are those of trackers with default settings, for the same
+    pixels at all poses and without randomness.
     """
-    measured = frame.measured_pixels()
-    # The same for all poses; 128 give smooth curves, and are fast enough for a slider.
-    rows, columns = measured[:, :: 1 + measured.shape[1] // 128]
+    pixels = frame.measured_pixels()
+    # About 128 pixels give smooth curves, and are fast enough for a slider.
+    rows, columns = pixels[:, :: 1 + pixels.shape[1] // 128]
     directions_camera = pixel_directions(frame.camera, columns, rows)
     color, depth = frame.at(rows, columns)
     points_camera = directions_camera * depth[:, None]
-    T_true, budget = frame.T_world_camera, StepBudget(1)  # trackers need them, their losses do not
+    T_true, budget = frame.T_world_camera, StepBudget(1)  # to construct trackers; losses need none
     sdf, vr = SdfTracker(distance, T_true, budget), VrTracker(density, T_true, budget)
-    vr.generator = None  # without it samples along rays lie in fixed places
+    vr.generator = None  # without a generator samples along rays are not random
     losses = []
     for x_cm in _OFFSETS_CM:
         T_world_camera = move_sideways(frame, x_cm, y_deg)
@@ -62,10 +64,11 @@ def pose_losses(
 def plot_pose_losses(
     density: LearnedField, distance: Field, frame: Frame, x_cm: float = 0.0, y_deg: float = 0.0
 ) -> Figure:
-    """Both losses of `pose_losses` along x, and what the density renders at a moved pose.
+    """Both losses of `pose_losses` along x, and what the density renders at one pose.
 
-    Curves have the colour of their method, full with the camera turned by `y_deg`, pale without. A
-    dot is the pose moved by `x_cm` and turned, the line through it the gradient. With sliders:
+    Each loss has two curves: with the camera turned by `y_deg`, and a pale one without a turn. A
+    dot marks the pose that is moved by `x_cm` and turned, with the gradient as a line through it;
+    this pose is also rendered. For sliders:
     `interact(plot_pose_losses, density=fixed(...), ..., x_cm=(-20, 20), y_deg=(-10, 10))`.
     """
     straight = pose_losses(density, distance, frame)
@@ -73,42 +76,42 @@ def plot_pose_losses(
     sdf_cm, vr_cm = turned[[_SDF_LOSS, _VR_LOSS]].idxmin()
     title = f"Turned by {y_deg:g}°, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
     title += ": a turn is traded for a shift" if sdf_cm and vr_cm else ""
-    *panels, view = new_axes(title.replace("-", "−"), 2.9, 1, 3)[0]  # a minus, no hyphen
+    *panels, view = new_axes(title.replace("-", "−"), 2.9, 1, 3)[0]  # minus signs for hyphens
     T_world_camera = move_sideways(frame, x_cm, y_deg).double().numpy()
     rendered_color, _ = density.render_view(frame.camera, T_world_camera)
     view.imshow(rendered_color)
     view.set_title("the view from this pose")
     view.axis("off")
-    tangent_cm = np.array([-5, 0, 5])  # from the pose, of three points on the tangent
+    tangent_cm = np.array([-5, 0, 5])  # offsets along x of three points on the tangent
     for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
         axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
         axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
         axes.plot(turned[name].idxmin(), turned[name].min(), "v", color="0.3", label="lowest")
         loss = np.interp(x_cm, turned.index, turned[name])
         gradient = np.interp(x_cm, turned.index, np.gradient(turned[name], turned.index))
-        # Only the middle point, the pose itself, has a dot.
+        # Only the middle one of the three points, the pose itself, has a dot.
         look = {"marker": "o", "markevery": [1], "label": "this pose, its gradient"}
         axes.plot(x_cm + tangent_cm, loss + gradient * tangent_cm, color="0.3", **look)
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
     figure = view.figure.legend_below()
-    for line in figure.legends[0].get_lines():  # grey: they stand for curves of both colours
-        line.set_color("0.3")
+    for line in figure.legends[0].get_lines():
+        line.set_color("0.3")  # grey, since the legend is for the curves of both colours
     return figure
 
 
 @styled
 def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
-    """SDF's loss and the mean density of `pose_losses`, with dots where each would pull the camera.
+    """SDF's loss and the mean density of `pose_losses`, with a dot where each is best.
 
-    That is where the loss is lowest, and where the density is highest.
+    A search would end where the loss is lowest, or where the density is highest.
     """
-    # By column: which extreme pulls the camera, and where it is (cm).
-    best = {_SDF_LOSS: ("lowest", curves[_SDF_LOSS].idxmin())}
-    best[_DENSITY] = "highest", curves[_DENSITY].idxmax()
+    # For each column the kind of extreme that a search looks for, and its place (cm).
+    extremes = {_SDF_LOSS: ("lowest", curves[_SDF_LOSS].idxmin())}
+    extremes[_DENSITY] = "highest", curves[_DENSITY].idxmax()
     panels = new_axes(title, 2.9, 1, 2)[0]
-    for axes, name, color in zip(panels, best, _COLORS.values(), strict=True):
-        extreme, best_cm = best[name]
+    for axes, name, color in zip(panels, extremes, _COLORS.values(), strict=True):
+        extreme, best_cm = extremes[name]
         label = f"{extreme}, at {best_cm} cm"
         axes.plot(curves[name], color=color)
         axes.plot(best_cm, curves[name][best_cm], "o", color="0.3", label=label)
@@ -120,12 +123,12 @@ def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
 
 @styled
 def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, near: float) -> Figure:
-    """The path of each tracker's steps over the mean |d| of a frame, and its error at each step.
+    """The path of each tracker's steps in one frame, and its position error after each step.
 
-    Trackers, by label, share one map. The title says after how many steps of its budget each is
-    first within `near` metres of the true position, or how far off it ends. The mean |d| is that of
-    at most 2000 points, with the camera moved along its true x and z and not turned; trackers also
-    turn.
+    `trackers`, by label, share one map; each searches from `T_start` (m) until its budget is spent.
+    The title says after how many steps each is first within `near` metres of the true position, or
+    how far off it ends. Behind the paths is the mean |d| of at most 2000 measured points, with the
+    camera moved along its true x and z axes and not turned. Trackers also turn.
     """
     paths_cm = {label: _path_cm(tracker, frame, T_start) for label, tracker in trackers.items()}
     errors_mm = {label: 10 * np.linalg.norm(path, axis=1) for label, path in paths_cm.items()}
@@ -137,13 +140,14 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
         else:
             arrivals.append(f"{label} is {errors[-1]:.0f} mm off after {len(errors) - 1} steps")
     plane, by_step = new_axes("; ".join(arrivals), 3.6, 1, 2, width_ratios=[1.2, 1])[0]
-    field = next(iter(trackers.values())).field
+    first, *_ = trackers
+    field = trackers[first].field
     _draw_mean_distance(plane, field, frame, np.concatenate([*paths_cm.values(), [[0, 0, 0]]]))
     for label, color in method_colors(paths_cm).items():
         look = {"color": color, "marker": ".", "markersize": 4, "label": label}
         plane.plot(paths_cm[label][:, 0], paths_cm[label][:, 2], **look)
         by_step.plot(errors_mm[label], **look)
-    x_start, _, z_start = next(iter(paths_cm.values()))[0]  # the same for all
+    x_start, _, z_start = paths_cm[first][0]  # the start, which all share
     marks = {"color": "black", "linestyle": ""}
     plane.plot(x_start, z_start, "s", label="start", **marks)
     plane.plot(0, 0, "*", markersize=10, label="true pose", **marks)
@@ -156,15 +160,16 @@ def plot_steps(trackers: Mapping[str, Tracker], frame: Frame, T_start: Pose, nea
 
 
 def _draw_mean_distance(axes: Axes, field: Field, frame: Frame, places_cm: np.ndarray) -> None:
-    """Draw the mean |d| (cm) of a frame's points over offsets (cm) of the true camera's x and z.
+    """Draw the mean |d| (cm) of a frame's points over offsets (cm) of the camera along x and z.
 
-    Offsets form a grid of 21 by 21 that reaches 1 cm beyond `places_cm` (n, 3; camera's frame).
+    Offsets from the true pose form a grid of 21 by 21, which reaches 1 cm beyond `places_cm` (n, 3;
+    in the true camera's frame).
     """
     x, _, z = np.linspace(places_cm.min(axis=0) - 1, places_cm.max(axis=0) + 1, 21).T
     pixels = frame.measured_pixels()
     points_camera, _ = frame.points(*pixels[:, :: 1 + pixels.shape[1] // 2000])
-    (offsets_cm,) = np.stack(np.meshgrid(x, 0, z), axis=-1)  # (x, z, 3): there is one y alone
-    moved_camera = points_camera.numpy() + offsets_cm[:, :, None] / 100
+    grid_cm = np.stack(np.meshgrid(x, 0, z, indexing="ij"), axis=-1)  # (21, 1, 21, 3): y is 0
+    moved_camera = points_camera.numpy() + grid_cm[:, 0, :, None] / 100
     T_true = frame.T_world_camera
     _, sdf = query_field(field, moved_camera @ T_true[:3, :3].T + T_true[:3, 3])
     mean_cm = 100 * np.abs(sdf).mean(axis=-1)
@@ -173,7 +178,7 @@ def _draw_mean_distance(axes: Axes, field: Field, frame: Frame, places_cm: np.nd
 
 
 def _path_cm(tracker: Tracker, frame: Frame, T_start: Pose) -> np.ndarray:
-    """Positions of the start and after each step (steps + 1, 3; cm, in the true camera's frame)."""
+    """Positions at the start and after each step (steps + 1, 3; cm, in the true camera's frame)."""
     tracker.begin(frame.to(tracker.device), torch.from_numpy(T_start)[None])
     poses = [T_start]
     for _ in tracker.budget.frame():

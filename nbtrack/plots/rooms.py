@@ -29,20 +29,19 @@ def plot_slice(
     room: Room | None = None,
     title: str = "",
 ) -> Figure:
-    """A field's values on the horizontal plane `height` metres up, drawn as `draw_slice` does.
+    """The values of a field on a horizontal plane, `height` metres up, seen from above.
 
-    Fields of one recording stand side by side, in the colour scale of the first. `sequence` are the
-    frames that the maps were made of; `height` is by default the cameras' mean. `room` is the exact
-    scene, if it is known: its surface is dashed green, and its distance stands before those of the
-    fields. The axes end around the path and what the frames have seen, within the room. What single
-    rays saw between others counts as not seen.
+    Several fields of one recording are drawn side by side, with the colour scale of the first.
+    `sequence` holds the frames that the maps were made from; the default `height` is the mean of
+    its cameras. If the exact `room` is known, its surface is a dashed green line, and its exact
+    distance is drawn before the fields. The axes cover the camera path and what the frames have
+    seen (inside the room). Spots that only a few rays have seen count as not seen.
     """
     drawn = [fields] if isinstance(fields, Field) else [*fields]
     if room is not None and drawn[0].is_distance:
         drawn.insert(0, ExactDistance(room, drawn[0]))
-    # Lower with more panels, which are narrower.
     panels = new_axes(title, 5.4 - 0.8 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
-    norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # the first field's, for all
+    norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # those of the first, for all
     of_cameras = (sequence.T_world_camera[:, :3, 3] @ scene.up_of(sequence.T_world_camera)).mean()
     height = of_cameras if height is None else height
     above = f", {of_cameras - height:.1f} m higher up" if abs(of_cameras - height) > 0.05 else ""
@@ -51,21 +50,21 @@ def plot_slice(
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / 240  # m
         points, places = _level_grid(page, low, high + step, step, height * up)
-        shown = binary_opening(seen_by(points, sequence), iterations=2)
-        norm = scene.draw_slice(axes, field, points, places, shown, norm, **bar)
+        is_seen = binary_opening(seen_by(points, sequence), iterations=2)  # without small spots
+        norm = scene.draw_slice(axes, field, points, places, is_seen, norm, **bar)
         what = f": {field.value_label.partition(' ')[0]} of {field.surface_level:g}"
-        # Without points: it only names the lines drawn above in the legend.
+        # Without points: an entry in the legend for the surface that `draw_slice` drew.
         axes.plot([], [], "k-", label="surface" if field.is_distance else f"surface{what}")
         if room is not None:
-            shown = shown & _draw_true_level(axes, room, points, places)
+            is_seen = is_seen & _draw_true_level(axes, room, points, places)
         axes.plot([], [], "s", color=scene.UNSEEN, label="hardly or never seen")
         axes.set_title(f"{field.label}, {height:.2f} m up")
-        _end_around(axes, places[shown], sequence.T_world_camera[:, :3, 3] @ page.T)
+        _end_around(axes, places[is_seen], sequence.T_world_camera[:, :3, 3] @ page.T)
     return panels[0].figure.legend_below()
 
 
 def _draw_true_level(axes: Axes, room: Room, points: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """A room's true surface, dashed, on a slice; returns which of its points lie in the room."""
+    """Draw a room's true surface on a slice, dashed; returns which points lie in free space."""
     sdf = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:2])
     scene.draw_levels(axes, places, sdf, [0.0], zorder=3, **_TRUE_LINE)
     axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
@@ -73,36 +72,38 @@ def _draw_true_level(axes: Axes, room: Room, points: np.ndarray, places: np.ndar
 
 
 def _end_around(axes: Axes, *places: np.ndarray) -> None:
-    """End axes 0.1 m around places on the page (n, 2); side by side only the first labels y."""
+    """Limit axes to 0.1 m around places on the page (n, 2), and leave labels to outer axes."""
     x, y = np.concatenate(places).T
     axes.set_xbound(x.min() - 0.1, x.max() + 0.1)
-    axes.set_ybound(y.min() - 0.1, y.max() + 0.1)  # an axis that is turned around stays so
+    axes.set_ybound(y.min() - 0.1, y.max() + 0.1)  # unlike set_ylim, this keeps an inverted axis
     axes.label_outer()
 
 
 def _level_grid(
     page: np.ndarray, low: np.ndarray, high: np.ndarray, step: float, raised: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (rows, columns, 3; m, world frame) of a level plane, and their places on a page.
+    """A grid on a horizontal plane: its points, and their places on the page.
 
-    The rows of `page` are its axes in the world. Places run from `low` to `high` on it, `step`
-    metres apart; `raised` is the vector (m) from the world's origin up to the plane.
+    Points are (rows, columns, 3; m, world frame), places (rows, columns, 2; m). Places lie between
+    `low` and `high`, `step` metres apart. The rows of `page` are the page's axes (world frame), and
+    `raised` is the vector (m) from the world's origin straight up to the plane.
     """
-    sides = [np.arange(a, b, step) for a, b in zip(low, high, strict=True)]
-    places = np.stack(np.meshgrid(*sides), axis=-1)
+    x, y = (np.arange(start, end, step) for start, end in zip(low, high, strict=True))
+    places = np.stack(np.meshgrid(x, y), axis=-1)
     return places @ page + raised, places
 
 
 @styled
 def plot_mesh(meshes: Mapping[str, trimesh.Trimesh], T_paths: Paths, title: str = "") -> Figure:
-    """Vertex-coloured meshes of a room by label, without the near walls and the ceiling.
+    """Vertex-coloured meshes of a room, by label, seen from outside, with camera paths on top.
 
-    One looks from outside, from where most of the first mesh shows its front; faces that show their
-    back are left out. The projection is parallel; lengths across the picture are true (m). The
-    camera-to-world poses by label are drawn on top; "true" is green, "tracked" red.
+    The viewer stands where the front of most of the first mesh is seen. Faces that show their back
+    are left out, so that the near walls and the ceiling do not hide the room. The projection is
+    parallel; horizontal lengths in the picture are true (m). `T_paths` are camera-to-world poses
+    (m) by label; "true" is green, "tracked" red.
     """
     panels = new_axes(title, 5.0 - 0.4 * len(meshes), 1, len(meshes), sharex=True, sharey=True)[0]
-    to_screen = None  # the first mesh's view, for all
+    to_screen = None  # the view of the first mesh, which the others share
     for axes, (label, mesh) in zip(panels, meshes.items(), strict=True):
         to_screen = scene.draw_mesh(axes, mesh, scene.up_of(*T_paths.values()), to_screen)
         scene.draw_paths(axes, T_paths, to_screen[:2])
@@ -117,10 +118,11 @@ def plot_map_and_slice(
 ) -> Figure:
     """A map as in the paper's Figure 1: its surface, a slice through its signed distance, paths.
 
-    The surface is drawn as `plot_mesh` draws it, from a grid of `voxel` metres. Beside it is the
-    slice at the cameras' mean height in the same projection, grey where no frame of `sequence` has
-    seen it. Both have camera-to-world poses (m) by label; the last panel has how far (mm) those
-    after the first are from the first, pose by pose.
+    The first panel has the surface as in `plot_mesh`, from a grid with cells of `voxel` metres. The
+    second has a horizontal slice at the cameras' mean height in the same projection; what no frame
+    of `sequence` has seen is grey. Both show the paths, which are camera-to-world poses (m) by
+    label. The last panel has the distances (mm) of the other paths from the first, pose by pose.
+    Poses may be NaN where they are unknown.
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
@@ -131,9 +133,10 @@ def plot_map_and_slice(
     paths = {label: path[:, :3, 3] for label, path in T_paths.items()}
     height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
     points = _level_points(np.concatenate([mesh.bounds, *paths.values()]), voxel, up, height)
-    shown = seen_by(points, sequence)
-    bar = {"ax": [room, level], "shrink": 0.7, "aspect": 25}  # beside both: they share a size
-    scene.draw_slice(level, field, points, points @ to_page.T, shown, **bar)
+    is_seen = seen_by(points, sequence)
+    # The colour bar is that of both panels, so that they keep the same size.
+    bar = {"ax": [room, level], "shrink": 0.7, "aspect": 25}
+    scene.draw_slice(level, field, points, points @ to_page.T, is_seen, **bar)
     level.set_axis_off()
     level.set_aspect("equal")
     for axes, name in (room, "surface: the zero level"), (level, "slice at the cameras' height"):
@@ -148,27 +151,29 @@ def plot_map_and_slice(
     return room.figure.legend_below()
 
 
-def _level_points(shown: np.ndarray, step: float, up: np.ndarray, height: float) -> np.ndarray:
-    """Points (rows, columns, 3; m, world frame) of a level plane, where some points (m) lie.
+def _level_points(inner: np.ndarray, step: float, up: np.ndarray, height: float) -> np.ndarray:
+    """A grid of points (rows, columns, 3; m, world frame) on a horizontal plane at a height (m).
 
-    Of those `shown` may be paths, which lead beyond what was seen.
+    The grid reaches beyond all points of `inner` (n, 3; m), whatever their height. Points with NaN
+    are ignored, such as those of unknown poses.
     """
-    level = np.eye(3)[up == 0]  # the two level axes of the world
-    places = shown @ level.T
-    low, high = places.min(axis=0) - step, places.max(axis=0) + 2 * step
-    return _level_grid(level, low, high, step, height * up)[0]
+    level = np.eye(3)[up == 0]  # the two horizontal axes of the world
+    places = inner @ level.T
+    low, high = np.nanmin(places, axis=0) - step, np.nanmax(places, axis=0) + 2 * step
+    points, _ = _level_grid(level, low, high, step, height * up)
+    return points
 
 
 @styled
 def plot_overview(
     cloud: pd.DataFrame, T_paths: Paths, frames: pd.DataFrame | None, title: str
 ) -> Figure:
-    """Coloured points (m) and paths from above, and the errors of a tracked run by frame.
+    """Coloured points (m) and camera paths from above, and the errors of a tracked run by frame.
 
-    The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255); what is higher
-    than all cameras is left out. Walls should be thin and straight: doubled or fanned ones mean
-    that a recording is read wrongly. `frames` are those of the run that is called "tracked";
-    without them, or without a known true pose, there are no errors.
+    The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255). Points above all
+    cameras are left out. Walls should look thin and straight: if they are doubled or spread like a
+    fan, the recording is read wrongly. `frames` are the rows of the run whose path is called
+    "tracked". Without them, or without any known true pose, the figure has no errors.
     """
     has_errors = frames is not None and frames["translation_error_m"].notna().any()
     panels = new_axes(title, 4.2 if has_errors else 6.0, 1, 2 if has_errors else 1)[0]

@@ -1,7 +1,7 @@
-"""What all pictures of rooms share: a mesh or a cloud, a slice through a field's values, paths.
+"""The parts of figures of rooms: meshes, point clouds, slices through a field's values, and paths.
 
-A room is seen from above, or from outside in a parallel projection. Up is the axis of the world
-that the cameras' own up is nearest to: they are mostly held upright.
+A room is seen from above, or from outside in a parallel projection. Cameras are mostly upright, so
+that the axis of the world that is nearest to their upward direction is taken as up.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,30 +22,32 @@ from nbtrack.plots.meshes import query_field
 from nbtrack.plots.style import method_colors
 
 Paths = Mapping[str, Poses]  # camera-to-world poses (m) by label
-_ELEVATION = np.radians(45)  # of the viewer of a mesh
-_AMBIENT = 0.75  # share of the light on a mesh that comes from everywhere
+_ELEVATION = np.radians(45)  # of the viewer of a mesh, above the horizon
+_AMBIENT = 0.75  # share of the light on a mesh that comes from all sides
 UNSEEN = "0.82"
-"""The grey of what no frame has seen; the scales of values hold no grey."""
-_CUT = 0.01  # share of a recording's points cut off at either end: wild depths hide the room
-_LINES_M = np.arange(-5.0, 5.01, 0.25).tolist()  # distances with a thin line
+"""The grey of what no frame has seen; no colour scale of values contains grey."""
+# The share of a cloud's points left out at either end of each axis: a few wrong depths would
+# otherwise make the room look small.
+_CUT = 0.01
+_LINES_M = np.arange(-5.0, 5.01, 0.25).tolist()  # signed distances (m) with a thin line in a slice
 
 
 def up_of(*T_paths: Poses) -> np.ndarray:
-    """The unit vector along an axis of the world, or against it, nearest to the cameras' mean up.
+    """The signed axis of the world (a unit vector) that is nearest to the cameras' mean up.
 
-    A camera's up is minus its y.
+    A camera's up is its -y axis. Poses may be NaN where they are unknown.
     """
-    above = -np.concatenate(T_paths)[:, :3, 1].mean(axis=0)
-    axis = np.abs(above).argmax()
-    return np.sign(above[axis]) * np.eye(3)[axis] + 0.0  # no -0.0
+    mean_up = -np.nanmean(np.concatenate(T_paths)[:, :3, 1], axis=0)
+    axis = np.abs(mean_up).argmax()
+    return np.sign(mean_up[axis]) * np.eye(3)[axis] + 0.0  # makes 0.0 of -0.0
 
 
 def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
-    """Rows: the picture's right, its upward direction, and the way to the viewer (world frame).
+    """The axes of a picture (rows: right, upward, towards the viewer) in the world frame.
 
-    The viewer stands 45 degrees above the horizon, at `azimuth_deg` about up.
+    The viewer is 45 degrees above the horizon, at the azimuth `azimuth_deg` about up.
     """
-    side = np.roll(up, 1)  # a horizontal axis of the world, for azimuth 0; either one will do
+    side = np.roll(up, 1)  # the direction of azimuth 0: either horizontal axis of the world will do
     azimuth = np.radians(azimuth_deg)
     level = np.cos(azimuth) * side + np.sin(azimuth) * np.cross(up, side)
     viewer = np.cos(_ELEVATION) * level + np.sin(_ELEVATION) * up
@@ -56,42 +58,42 @@ def screen_axes(up: np.ndarray, azimuth_deg: float) -> np.ndarray:
 def draw_mesh(
     axes: Axes, mesh: trimesh.Trimesh, up: np.ndarray, to_screen: np.ndarray | None = None
 ) -> np.ndarray:
-    """Draw the faces of a room's mesh that show their front, shaded, the nearest on top.
+    """Draw the faces of a room's mesh that show their front, shaded; returns the `screen_axes`.
 
-    A face's front is its side towards free space, of walls the one inside the room.
-
-    Returns the `screen_axes` of the view: those given, else those from where most surface shows its
-    front. Lengths across the picture are true (m).
+    The front of a face is its side towards free space: a wall shows it to viewers inside the room.
+    The view is that of `to_screen`, by default the one in which most of the surface shows its
+    front. Horizontal lengths in the picture are true (m).
     """
-    # Marching cubes orients faces by the sign of the field, which differs between densities and
-    # distances: 1 where normals point inwards, else -1, by most of the area, which is the shell's.
+    # The normals of marching cubes follow the sign of the field, which differs between densities
+    # and distances. `side` is 1 if they point to free space, else -1. Most of a room's surface is
+    # its shell, whose front points inwards; so the area decides.
     inwards = mesh.bounds.mean(axis=0) - mesh.triangles_center
     side = np.sign((inwards * mesh.face_normals).sum(axis=1) @ mesh.area_faces)
     if to_screen is None:
-        # None of the azimuths looks along the walls of a room aligned to the axes.
+        # None of these azimuths looks along the walls of a room that is aligned with the axes.
         screens = np.stack([screen_axes(up, azimuth) for azimuth in np.arange(15.0, 360.0, 30.0)])
-        cosines = side * mesh.face_normals @ screens[:, 2].T  # to viewers, (faces, azimuths)
+        cosines = side * mesh.face_normals @ screens[:, 2].T  # fronts to viewers (faces, azimuths)
         to_screen = screens[(mesh.area_faces @ cosines.clip(0)).argmax()]
     faces = mesh.faces[side * mesh.face_normals @ to_screen[2] > 0]
     corners = (mesh.vertices @ to_screen.T)[faces]
-    # Smoothed normals: those of single marching-cubes faces flicker.
+    # Normals are means over vertices, since those of single faces of marching cubes vary too much.
     normals = side * mesh.vertex_normals[faces].mean(axis=1)
     right, _, viewer = to_screen
-    light = viewer + 0.5 * right + 0.6 * up  # comes from above the viewer's right shoulder
+    light = viewer + 0.5 * right + 0.6 * up  # from above the viewer's right shoulder
     shade = _AMBIENT + (1 - _AMBIENT) * (normals @ light / np.linalg.norm(light)).clip(0)
     colors = mesh.visual.vertex_colors[faces, :3].mean(axis=1) / 255 * shade[:, None]
-    order = corners[..., 2].mean(axis=1).argsort()  # from the farthest to the nearest
+    order = corners[..., 2].mean(axis=1).argsort()  # from the farthest face to the nearest
     look = {"edgecolors": "face", "linewidths": 0.4, "rasterized": True}
     axes.add_collection(PolyCollection(corners[order, :, :2], facecolors=colors[order], **look))
     axes.set_aspect("equal")
-    axes.set_axis_off()  # a scale would be that of lengths across alone: others are shortened
+    axes.set_axis_off()  # no scale: all but horizontal lengths are shortened
     return to_screen
 
 
 def draw_scale(*panels: Axes) -> None:
-    """Draw a bar of 1 m, or of another power of ten, below all that is drawn on panels in metres.
+    """Draw a scale bar of 1 m, or another power of ten, below all that is drawn in each panel.
 
-    Panels share their scale, and bars are level.
+    Panels are in metres and have the same limits, so that all bars are at the same height.
     """
     low, high = Bbox.union([axes.dataLim for axes in panels]).get_points()
     length = 10.0 ** np.floor(np.log10(high[0] - low[0]))
@@ -102,52 +104,54 @@ def draw_scale(*panels: Axes) -> None:
 
 
 def draw_from_above(axes: Axes, T_paths: Paths) -> tuple[np.ndarray, np.ndarray]:
-    """Draw paths from above, on axes in metres of equal scales, so that nothing is mirrored.
+    """Draw paths from above, not mirrored, on axes in metres with equal scales.
 
-    Returns the world's axis that is up, and those to the right and ahead on the page, (2, 3).
+    Returns the axis of the world that points up, and the page's axes, to the right and ahead, in
+    the world frame (2, 3).
     """
     up = up_of(*T_paths.values())
-    is_level = up == 0  # up is along one of the world's axes; the others span the page
+    is_level = up == 0  # up is along one axis of the world; the two others span the page
     page = np.eye(3)[is_level]
     draw_paths(axes, T_paths, page)
     right, ahead = np.array(["x", "y", "z"])[is_level]
     axes.set(xlabel=f"{right} (m)", ylabel=f"{ahead} (m)", aspect="equal")
-    # Seen from above, the page's right, its upward direction and up must be right-handed.
+    # The page's right, its upward direction and up must form a right-handed frame.
     axes.yaxis.set_inverted(np.cross(*page) @ up < 0)
     return up, page
 
 
 def draw_paths(axes: Axes, T_paths: Paths, to_page: np.ndarray, width: float = 1) -> None:
-    """Draw trajectories by label, with a dot where the first one starts.
+    """Draw paths, camera-to-world poses (m) by label, with a dot at the start of the first.
 
-    The rows of `to_page`, (2, 3), are the page's axes in the world. `width` multiplies lines and
-    dot.
+    The rows of `to_page` (2, 3) are the page's axes in the world frame. `width` scales the width of
+    lines and the size of the dot.
     """
     dashes = cycle(("--", "-.", ":"))
     for label, color in method_colors(T_paths).items():
         x, y = to_page @ T_paths[label][:, :3, 3].T
         line = "-" if label == "true" else next(dashes)
-        # The true path is wide, so that the others do not hide it.
+        # The true path is wider, so that the others do not hide it.
         look = {"linewidth": width * (4.0 if label == "true" else 1.6), "color": color, "zorder": 3}
         axes.plot(x, y, line, label=label, **look)
-    start_x, start_y = to_page @ next(iter(T_paths.values()))[0, :3, 3]
+    first, *_ = T_paths.values()
+    start_x, start_y = to_page @ first[0, :3, 3]
     dot = {"color": "black", "markersize": 5 * width, "zorder": 4}
-    # A legend has four keys at most: beside four paths the start has no label.
+    # A legend has room for four labels, so that with four paths the start has none.
     axes.plot(start_x, start_y, "o", label="start" if len(T_paths) < 4 else "", **dot)
 
 
 def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
-    """Draw paths from above, and coloured points, without those higher than all cameras.
+    """Draw paths and coloured points from above, without a ceiling that would hide the room.
 
-    Without those, no ceiling hides the room. Returns the page's axes in the world, (2, 3): to the
-    right and ahead.
+    Points more than 0.1 m above all cameras are left out. Returns the page's axes, to the right and
+    ahead, in the world frame (2, 3).
     """
     up, page = draw_from_above(axes, T_paths)
     places = cloud[["x", "y", "z"]]
     inside = (places >= places.quantile(_CUT)) & (places <= places.quantile(1 - _CUT))
-    heights = (places @ up)[inside.all(axis=1)].sort_values()  # drawn from the floor up
-    highest = max((path[:, :3, 3] @ up).max() for path in T_paths.values())
-    shown = cloud.loc[heights[heights <= highest + 0.1].index]  # up to 0.1 m above the cameras
+    heights = (places @ up)[inside.all(axis=1)].sort_values()  # points are drawn from the floor up
+    highest = max(np.nanmax(path[:, :3, 3] @ up) for path in T_paths.values())
+    shown = cloud.loc[heights[heights <= highest + 0.1].index]
     colors = shown[["red", "green", "blue"]].to_numpy() / 255
     axes.scatter(*page @ shown[["x", "y", "z"]].to_numpy().T, c=colors, s=4, linewidths=0)
     return page
@@ -162,12 +166,13 @@ def draw_slice(
     norm: Normalize | None = None,
     **bar: object,
 ) -> Normalize:
-    """A field's values at a grid of points (m, world frame), drawn at places on the page.
+    """Draw a field's values at a grid of points (m, world frame), at `places` (m) on the page.
 
-    A signed distance is blue in free space and red in matter, with thin lines 0.25 m apart; a
-    density or an occupancy has a logarithmic scale. Black is the surface (the field's
-    `surface_level`). What no frame has seen is grey: there the field invents. `bar` holds options
-    of `Figure.colorbar`. Returns the scale; with that of another slice as `norm` no bar is drawn.
+    A signed distance is blue in free space and red in solids, with thin lines 0.25 m apart. A
+    density or an occupancy has a logarithmic colour scale. The surface, at the field's
+    `surface_level`, is a black line. Points that are not `seen` are grey, since there the field is
+    not supported by data. `bar` holds options of `Figure.colorbar`. Returns the colour scale; if
+    that of another slice is given as `norm`, it is used and no bar is drawn.
     """
     _, values = query_field(field, points)
     level = field.surface_level
@@ -183,21 +188,21 @@ def draw_slice(
         bar = {"ax": axes, "label": field.value_label, "extend": "both", **bar}
         axes.figure.colorbar(image, **bar)
     if field.is_distance:
-        # Light where the slice is dark.
+        # Lines are white where the slice is dark.
         tones = ["1" if abs(line) > 0.6 * image.norm.vmax else "0.35" for line in _LINES_M]
         draw_levels(axes, places, values, _LINES_M, colors=tones, linewidths=0.4, linestyles="-")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
     if seen is not None:
         veil = np.full((*seen.shape, 4), float(UNSEEN))
-        veil[..., 3] = ~seen  # transparent over what was seen
-        axes.pcolormesh(*page, veil, gid="unseen", zorder=2.5, **look)  # above the map's lines
+        veil[..., 3] = ~seen  # opacity: 0 over what was seen
+        axes.pcolormesh(*page, veil, gid="unseen", zorder=2.5, **look)  # above the slice's lines
     return image.norm
 
 
 def draw_levels(
     axes: Axes, places: np.ndarray, values: np.ndarray, levels: Sequence[float], **look: object
 ) -> None:
-    """Draw lines where values on a grid equal one of `levels`."""
-    # Where they equal none, matplotlib would warn.
+    """Draw lines where the values at `places` (a grid on the page) equal one of `levels`."""
+    # matplotlib warns if no line is to be drawn.
     if values.min() < max(levels) and min(levels) < values.max():
         axes.contour(*np.moveaxis(places, -1, 0), values, levels, **look)
