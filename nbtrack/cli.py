@@ -127,6 +127,7 @@ class Parser(argparse.ArgumentParser):
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             choices = [choice.strip("' ") for choice in wrong[2].split(",")]
             message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
+            message += "; options follow the command" if self.prog == "nbtrack" else ""
         raise ConfigError(f"{message}; see {self.prog} --help")
 
 
@@ -207,5 +208,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     if unknown:
         given = unknown[0].partition("=")[0]
         known = [name for name in options.parser._option_string_actions if name.startswith("--")]
-        options.parser.error(f"unknown argument {unknown[0]!r}: {nearest_name(given, known)}")
+        takers = [name for name, (_, words) in COMMANDS.items() if given in words.split()]
+        hint = f"only for {', '.join(takers)}" if takers else nearest_name(given, known)
+        options.parser.error(f"unknown argument {unknown[0]!r}: {hint}")
     return options

@@ -65,6 +65,12 @@ REFUSED = {
     "two sessions": (["A_0", "A_1", "A_2", "B_0", "B_1", "B_2"], "one session; .*: A_0.png, B_0."),
     "no numbers": (["a", "b", "c"], ": a.png, b.png"),
     "a counter that wrapped": (WRAPPED, r"numbers 0 to 2 and 9997 to 9999: .* back to 0 at 10000"),
+    "midnight": (["23-59-58", "23-59-59", *(f"00-00-0{i}" for i in range(4))], "back to 0 at 24"),
+    "noon": ([f"{h}-{m}" for h, m in ((12, 58), (12, 59), (1, 0), (1, 1))], "back to 0 at 12"),
+    "a month's end": (
+        ["30-09-23-58", "30-09-23-59", *(f"01-10-00-0{i}" for i in range(4))],
+        "back to 0 at 31",
+    ),
     "of a byte, each third": ([str(i % 256) for i in range(247, 264, 3)], "back to 0 at 256"),
     "a clock that fell back": ([f"{i}_{t:.3f}" for i, t in enumerate(FELL_BACK)], "row 4"),
     "the clock first": ([f"{t:.3f}_{i}" for i, t in enumerate(FELL_BACK)], "in two ways"),

@@ -125,10 +125,11 @@ def check_order(files: list[Path]) -> None:
         is_counter = len(set(numbers.tolist())) == len(files) and np.ptp(numbers) < 2 * len(files)
         if is_counter and (steps < 0).any():
             raise DataError(f"{names} have numbers that order them in two ways: keep one of both")
-        usual, last = np.median(steps) if len(steps) else 0, numbers[-1]
+        # Hours, minutes or days repeat, and rise by 1 at a time.
+        usual, last = max(1, np.median(steps)) if len(steps) else 0, numbers[-1]
         # If a counter went back to 0 at `end`, its sorted numbers have a wide gap, and from the
         # last number it is a usual step over `end` to the first one.
-        for end in (10 ** len(str(last)), 2**8, 2**16, 2**32):
+        for end in (10 ** len(str(last)), 12, 24, 31, 60, 2**8, 2**16, 2**32):
             step_over_end = numbers[0] + end - last
             if 0 < step_over_end <= 2 * usual and steps.max() > 10 * usual:
                 i = steps.argmax()

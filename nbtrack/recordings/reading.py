@@ -91,9 +91,8 @@ def select_frames(recording: Recording, frames: Any, needs_poses: bool = True) -
     try:
         frame_ids = np.atleast_1d(np.arange(len(recording))[frames])
     except (IndexError, TypeError, ValueError):
-        found = f"frames {frames!r:.80} of {recording.folder}"
-        advice = f"give a slice or a list of numbers below {len(recording)}"
-        raise DataError(f"{found}: {advice}") from None
+        advice = f"give a slice, or a list of numbers below {len(recording)}"
+        raise DataError(f"frames {frames!r:.80} of {recording.folder}: {advice}") from None
     found = f"{len(frame_ids)} of the {len(recording)} frames in {recording.folder} are selected"
     if needs_poses:
         frame_ids = frame_ids[recording.has_pose[frame_ids]]
