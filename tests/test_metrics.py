@@ -13,7 +13,7 @@ from nbtrack.beyond.verdict import score_detection
 from nbtrack.checks.in_map import in_world_of_map, other_world
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import json_text, write_atomic
-from nbtrack.recordings.pose_files import read_tum, tum_text
+from nbtrack.recordings.pose_files import read_tum, shifted, tum_text
 from nbtrack.tracking import Trajectory
 from nbtrack.tracking.metrics import align_rigidly, pose_errors, still_metrics, trajectory_metrics
 
@@ -128,10 +128,12 @@ def test_detection_of_lost_frames() -> None:
 
 
 def test_tum_round_trip(tmp_path: Path) -> None:
-    """Catches digits cut off, an inverted pose, a wrong quaternion order; and blanks too many and
-    negative zeros, which strict readers refuse or show."""
+    """Catches digits cut off, an inverted pose, a wrong quaternion order; blanks too many and
+    negative zeros, which strict readers refuse or show; and poses that are moved in place."""
     true, times = wandering(50, seed=7), 1305031102.175304 + np.arange(50) / 30
     true[0] = np.diag([1.0, -1, -1, 1])
+    moved = shifted(true, np.array([1.0, -2.0, 3.0]))
+    np.testing.assert_allclose(moved[:, :3, 3] - true[:, :3, 3], [[1.0, -2.0, 3.0]] * 50)
     text = tum_text(times, true)
     for line in text.splitlines()[1:]:
         assert line == " ".join(line.split())
