@@ -134,6 +134,8 @@ def test_tum_round_trip(tmp_path: Path) -> None:
     true[0] = np.diag([1.0, -1, -1, 1])
     moved = shifted(true, np.array([1.0, -2.0, 3.0]))
     np.testing.assert_allclose(moved[:, :3, 3] - true[:, :3, 3], [[1.0, -2.0, 3.0]] * 50)
+    moved[1, 2, 3] = np.nan
+    assert len(tum_text(times, moved).splitlines()) == 1 + 49
     text = tum_text(times, true)
     for line in text.splitlines()[1:]:
         assert line == " ".join(line.split())
