@@ -350,9 +350,11 @@ def test_a_hall(tmp_path: Path) -> None:
 
 
 def test_black_images(tmp_path: Path) -> None:
-    """Catches advice to set what no tracker reads."""
+    """Catches advice to set what no tracker reads, and points that were not measured."""
     case = Case("", change=lambda data: data._replace(colors=0 * data.colors))
     report = check(write(tmp_path / "r", "office", case))
+    assert (report.frames.measured < 1).all()
+    assert (report.cloud.depth > 0).all()
     (advice,) = (text for text in report.warnings if "images are black" in text)
     settings = re.findall(r"tracking\.\w+\.\w+=0", advice)
     changed = with_settings(load_preset("smoke"), *settings)

@@ -200,8 +200,11 @@ def test_hypotheses_stand_upright() -> None:
 
 
 def test_poses_keep_their_digits() -> None:
-    """Catches double poses that pass through single precision at every frame."""
+    """Catches double poses that pass through single precision at every frame, and a frame without
+    depth of which the tracker says nothing."""
     T_start = retract(T_TRUE, np.array([0, 0, 0, 1 / 3, 1 / 7, -1 / 9]))
     tracker = LmTracker(ROOM, T_start, StepBudget(1))
     blank = replace(FRAME, depth_mm=0 * FRAME.depth_mm)  # where nothing is seen the start stays
-    np.testing.assert_allclose(tracker.track(blank).T_world_camera, T_start, rtol=0, atol=1e-15)
+    estimate = tracker.track(blank)
+    np.testing.assert_allclose(estimate.T_world_camera, T_start, rtol=0, atol=1e-15)
+    assert estimate.report == {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}
