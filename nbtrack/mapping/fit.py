@@ -67,13 +67,13 @@ def map_sequence(
     if issubclass(kind, LearnedField):
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
             with threads(1):  # the rounding of sums, and so the start, depends on their number
-                field = make_field(field_name, network, bounds, seed).to(device or "cpu")
+                field = make_field(field_name, network, bounds, seed).to(device)
             with suited_to(field.width, settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)
                 fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
     else:
-        field = kind.from_frames(sequence, mapped, bounds, settings).to(device or "cpu")
+        field = kind.from_frames(sequence, mapped, bounds, settings).to(device)
         history, seconds = [field.diagnostics()], time.perf_counter() - start
         on_iteration(1.0, history[0])
     made = {"seconds": seconds, "mapped_frames": len(mapped), "device": device_name(field.device)}
