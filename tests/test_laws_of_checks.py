@@ -127,29 +127,34 @@ def test_a_cause_is_named() -> None:
 def test_which_convention_is_the_best() -> None:
     """Catches one that is taken although it is hardly better, meets too little, lies far apart or
     has absurd depths; of those that fit alike the first counts."""
-    first, second = (replace(OWN, name=name, agreement=0.6) for name in "ab")
+    first, second = (replace(OWN, name=name, agreement=0.6, apart=9e-4) for name in "ab")
     assert _best_of([OWN, first, second]) is first
     alike = replace(first, agreement=0.575)
     assert _best_of([OWN, alike, second]) is alike
     assert _best_of([OWN, replace(first, agreement=0.56), second]) is second
     nearer = replace(OWN, apart=0.0003, agreement=0.45)
     assert _best_of([OWN, nearer]) is nearer
-    changes = {"agreement": 0.5}, {"overlap": 0.1}, {"apart": 0.02}, {"depth_m": 0.1}
+    changes = {"agreement": 0.5}, {"overlap": 0.1}, {"apart": 0.0011}, {"depth_m": 0.1}
     for change in (*changes, {"depth_m": 21.0, "apart": 1e-5}):
         assert _best_of([OWN, replace(first, **change)]) is OWN
 
 
 def test_doubts_of_poses() -> None:
     """Catches proof that is asked for in vain, and overlap that is told in place of motion."""
+    recording = mock.Mock(spec=Recording, pose_file=Path("p.txt"))
+
+    def doubts(needs_proof: bool, *conventions: Convention) -> list[str]:
+        found = findings.doubts_of_poses([*conventions], recording, needs_proof, frames())
+        return list(found)
+
     other = replace(OWN, name="other")
-    (alike,) = findings.doubts_of_poses([OWN, other], "p.txt", True)
+    (alike,) = doubts(True, OWN, other)
     assert "tell 1 other conventions apart, such as other" in alike
-    assert [*findings.doubts_of_poses([OWN, other], "p.txt", False)] == []
-    clear = replace(other, agreement=0.3)
-    depth = replace(other, subject="depth")
-    assert [*findings.doubts_of_poses([OWN, clear, depth], "p.txt", True)] == []
+    assert doubts(False, OWN, other) == []
+    clear, depth = replace(other, agreement=0.3), replace(other, subject="depth")
+    assert doubts(True, OWN, clear, depth) == []
     for unknown in (replace(OWN, overlap=0.14), replace(OWN, apart=np.nan)):
-        assert "too little of the same" in next(findings.doubts_of_poses([unknown], "p", False))
+        assert "too little of the same" in doubts(False, unknown)[0]
 
 
 def test_a_step_of_a_fit_by_hand() -> None:
