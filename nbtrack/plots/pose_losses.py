@@ -173,6 +173,7 @@ def _draw_mean_distance(axes: Axes, field: Field, frame: Frame, places_cm: np.nd
     T_true = frame.T_world_camera
     _, sdf = query_field(field, moved_camera @ T_true[:3, :3].T + T_true[:3, 3])
     mean_cm = 100 * np.abs(sdf).mean(axis=-1)
+    # Transposed, since rows of `contourf` belong to its y axis, here z.
     filled = axes.contourf(x, z, mean_cm.T, np.arange(0, mean_cm.max() + 0.25, 0.25), cmap="Greys")
     axes.figure.colorbar(filled, ax=axes, label="mean |d| (cm)")
 

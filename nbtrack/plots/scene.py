@@ -177,13 +177,13 @@ def draw_slice(
     _, values = query_field(field, points)
     level = field.surface_level
     if field.is_distance:
-        limit = 0.25 * max(1, np.ceil(np.quantile(np.abs(values), 0.98) / 0.25))  # m
+        limit = 0.25 * max(1, np.ceil(np.quantile(np.abs(values), 0.98) / 0.25))  # m, on a line
         own_norm, colors = Normalize(-limit, limit), "RdBu"
     else:
         own_norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
     look = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
-    page = np.moveaxis(places, -1, 0)
-    image = axes.pcolormesh(*page, values, cmap=colors, norm=norm or own_norm, **look)
+    xy = np.moveaxis(places, -1, 0)  # matplotlib takes two arrays of coordinates
+    image = axes.pcolormesh(*xy, values, cmap=colors, norm=norm or own_norm, **look)
     if norm is None:
         bar = {"ax": axes, "label": field.value_label, "extend": "both", **bar}
         axes.figure.colorbar(image, **bar)
@@ -193,9 +193,9 @@ def draw_slice(
         draw_levels(axes, places, values, _LINES_M, colors=tones, linewidths=0.4, linestyles="-")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
     if seen is not None:
-        veil = np.full((*seen.shape, 4), float(UNSEEN))
-        veil[..., 3] = ~seen  # opacity: 0 over what was seen
-        axes.pcolormesh(*page, veil, gid="unseen", zorder=2.5, **look)  # above the slice's lines
+        veil = np.full((*seen.shape, 4), float(UNSEEN))  # red, green, blue, opacity
+        veil[..., 3] = ~seen  # transparent over what was seen
+        axes.pcolormesh(*xy, veil, gid="unseen", zorder=2.5, **look)  # above the slice's lines
     return image.norm
 
 

@@ -117,6 +117,7 @@ def method_colors(labels: Iterable[str]) -> dict[str, str]:
     palette that no given label has, except for the first four, which stand for the paper's methods
     and for LM.
     """
+    # None for a label whose method has no colour of its own.
     fixed = {label: _FIXED.get(label, _FIXED.get(label.split(",")[0])) for label in labels}
     free = cycle([color for color in PALETTE[4:] if color not in fixed.values()])
     return {label: next(free) if color is None else color for label, color in fixed.items()}
