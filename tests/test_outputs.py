@@ -18,6 +18,7 @@ import pytest
 import torch
 import trimesh
 from finished import GIVEN, MAP, OWN, SET
+from PIL.PngImagePlugin import PngImageFile
 from recordings import N_FRAMES, write_recording
 from test_faults import assert_refused, contents
 from tiny import tiny_words
@@ -36,6 +37,23 @@ from nbtrack.recordings.recording import open_recording
 from nbtrack.synthetic import make, room
 
 PROJECT = Path(__file__).parents[1]
+# How often each file was opened in this process, whatever module opened it.
+_opened: Counter[str] = Counter()
+sys.addaudithook(lambda event, about: event == "open" and _opened.update([str(about[0])]))
+
+
+def test_track_reads_a_file_once(tmp_path: Path, monkeypatch) -> None:
+    """Catches a check, an estimate of the unit, a digest, a map, a run or a picture that opens or
+    decodes for itself what another part of the command has read."""
+    folder = write_recording("neural_rgbd", tmp_path / "room")
+    decoded, end = [], PngImageFile.load_end
+    monkeypatch.setattr(PngImageFile, "load_end", lambda i: decoded.append(i.mode) or end(i))
+    _opened.clear()
+    words = ["--method", "sdf", "--steps", "2", "--out", str(tmp_path / "run")]
+    assert main(["track", str(folder), *words, *tiny_words()]) == 0
+    files = [str(file) for file in folder.glob("*/*.png")]
+    assert {_opened[file] for file in files} == {1}
+    assert len(decoded) == len(files) == 2 * decoded.count("I;16")
 
 
 def test_a_recording_is_never_written_to(work: Path, capsys, monkeypatch) -> None:
