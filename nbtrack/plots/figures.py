@@ -204,8 +204,7 @@ def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
             end = index[last], error_cm[last]
             axes.annotate(label, end, (5, 0), textcoords="offset points", color=color, va="center")
     still = list(frames.values())[-1]  # the same in every run of these frames
-    error_cm = 100 * still["still_error_m"]
-    axes.plot(still["frame_id"], error_cm, label=STANDING_STILL, **style.DOTTED)
+    axes.plot(still["frame_id"], 100 * still["still_error_m"], label=STANDING_STILL, **style.DOTTED)
     axes.set_ylabel("translation error (cm)")
     style.log_axes(axes, "y")
 
