@@ -165,6 +165,7 @@ def test_lost_where_the_points_fit_as_well_elsewhere(scene: str, turn: tuple) ->
     tracker = make_tracker("icp", cloud, T_world_camera, StepBudget(1))
     camera, color = Intrinsics(80, 60, 40.0, 40.0, 40.0, 30.0), np.zeros((60, 80, 3), np.uint8)
     assert tracker.track(Frame.of_images(camera, color, depth)).lost == (not is_held)
+    assert np.median(tracker._distances(T_world_camera)) < 0.01  # m, of each point from its plane
 
 
 def test_a_killed_run_goes_on(room: Room, tmp_path, monkeypatch) -> None:
