@@ -281,3 +281,14 @@ def test_poses_between_stamps_are_interpolated(tmp_path: Path, direction: str) -
     (note,) = (text for text in recording.notes if "interpolated" in text)
     assert note.startswith("groundtruth.txt: 1 of 6 poses")
     assert "20.0 ms" in note
+
+
+@pytest.mark.parametrize("name", ["replica", "neural_rgbd"])
+def test_a_recording_that_counts_from_0_and_was_cut(tmp_path: Path, name: str) -> None:
+    """Catches poses of other frames, or an alarm, where numbers are places in the list."""
+    folder = write_recording(name, tmp_path / "r")
+    whole = open_recording(folder)
+    for file in [*whole.color_files[:3], *whole.depth_files[:3]]:
+        file.unlink()
+    cut = open_recording(folder)
+    np.testing.assert_allclose(cut.T_world_camera, whole.T_world_camera[3:], atol=1e-9)
