@@ -95,7 +95,9 @@ def test_another_world_is_told_from_errors() -> None:
     estimated[:, :3, 3] += noise
     estimated[::3] = wandering(14, seed=9)  # lost frames do not change the world
     np.testing.assert_allclose(other_world(estimated, true), moved, atol=0.02)
-    tracked = Trajectory(estimated, true, pd.DataFrame({"translation_error_m": [9.0] * 40}))
+    partly_known = np.concatenate([true[:39], np.full((1, 4, 4), np.nan)])
+    frames = pd.DataFrame({"translation_error_m": [9.0] * 40})
+    tracked = Trajectory(estimated, partly_known, frames)
     found, is_other = in_world_of_map(tracked)
     assert is_other
     assert found.frames["translation_error_m"].median() < 0.05
