@@ -91,6 +91,7 @@ BROKEN: dict[tuple[str, str], tuple[Damage, str]] = {
     ("neural_rgbd", "PGM"): (lambda f: (f / DEPTHS).rename(f / "pgm"), r"no depth maps \(PNG"),
     ("neural_rgbd", "size"): (image(DEPTH_1, np.ones((18, 24), np.uint16)), r"\(18, 24\)"),
     ("neural_rgbd", "8 bits"): (image(DEPTH_1, np.ones((36, 48), np.uint8)), "depth1.png is uint8"),
+    ("neural_rgbd", "16 bits"): (image(IMAGE_1, np.ones((36, 48), np.uint16)), "img1.png is uint1"),
     ("neural_rgbd", "cut"): (changed(IMAGE_1, lambda c: c[:-999] + c[-12:]), "img1.png .*readable"),
     ("neural_rgbd", "a bit flipped"): (changed(DEPTH_1, flipped), "depth1.png .*readable"),
     ("neural_rgbd", "giant depth"): (text(DEPTH_1, giant_png()), "depth1.png .*readable"),
