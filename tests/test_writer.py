@@ -32,7 +32,7 @@ def test_converter(tmp_path: Path, capsys) -> None:
     cannot say it, a slice that is ignored, and a folder without frames."""
     camera = Intrinsics(48, 36, 43.0, 44.5, 25.25, 17.0)
     folder = write_recording("plain", tmp_path / "r", source()._replace(camera=camera))
-    out, convert = tmp_path / "out", ["data", "convert", str(folder)]
+    out, convert = tmp_path / "a/b/out", ["data", "convert", str(folder)]
     assert main([*convert, str(out), "--frames", "2:5"]) == 0
     assert "it is in intrinsics.txt" in capsys.readouterr().out
     assert not (out / "focal.txt").exists()
