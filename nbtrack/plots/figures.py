@@ -66,11 +66,11 @@ def plot_views(
 
 
 @style.styled
-def plot_distances(frame: Frame, distances: Curves, title: str = "") -> Figure:
+def plot_distances(frame: Frame, distances: Curves, title: str = "", end_cm: float = 0) -> Figure:
     """A frame's colour image, and an image of |d| (cm) for each label; unmeasured pixels are grey.
 
     `distances` maps labels to the signed distances d (m) of a map at the frame's measured points,
-    in the order of `frame.measured_pixels()`.
+    in the order of `frame.measured_pixels()`. Colours end at `end_cm`, else as in `plot_images`.
     """
     rows, columns = frame.measured_pixels().cpu().numpy()
     panels = [("observed colour", frame.color.cpu().numpy(), "")]
@@ -79,7 +79,7 @@ def plot_distances(frame: Frame, distances: Curves, title: str = "") -> Figure:
         image_cm = np.ma.array(np.zeros(frame.depth_mm.shape), mask=True)
         image_cm[rows, columns] = 100 * sdf.abs().cpu().numpy()
         panels.append((f"{label}: mean {image_cm.mean():.2f} cm", image_cm, DISTANCE))
-    return plot_images([panels], title)
+    return plot_images([panels], title, {DISTANCE: end_cm})
 
 
 @style.styled
