@@ -34,9 +34,8 @@ _N_POINTS = 300_000  # random pixels are drawn; those that show a plane are used
 # have there. The surface must come first: `corrected` relies on it. The others lie within a voxel,
 # since surfaces are flat only nearby.
 _OFFSETS = (0.0, -0.03, -0.015, 0.015, 0.03)
-# Large scenes get more points, until cells with points have so many on average. Otherwise a frame
-# would see cells without any. Rooms have as many anyway; an office of 10 by 11 m had 3
-# (docs/tried.md).
+# Large scenes get more points, until cells with points have so many on average, or `_MAX_TIMES` as
+# many are drawn. Three rooms have 11 to 14; an office of 10 by 11 m has 1.3 (docs/tried.md).
 _POINTS_A_CELL = 10
 _MAX_TIMES = 4  # at most so many times `_N_POINTS` pixels are drawn
 # The smallest robust scales of a tracker's residuals (distance in m, luma) are so many times the

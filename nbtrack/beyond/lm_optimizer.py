@@ -128,7 +128,7 @@ class LmOptimizer:
         # In rad and m. H is in units of the robust scales, which are `SIGMAS` standard deviations.
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2
         by_curvature = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
-        # With more independent points, such as 384, some wrong poses before a flat wall would pass
+        # With more independent points, 384 or 512, some wrong poses before a flat wall passed
         # (docs/tried.md).
         pose = self.T_world_camera
         moved_std_m = std_when_moved(self._costs_at, pose, covariance, 1, n_independent=256)

@@ -28,8 +28,8 @@ _COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
 MAD_FACTOR = 3.0  # a robust scale is so many median absolute residuals (MAD)
 SIGMAS = 0.6745 * MAD_FACTOR  # the same scale in standard deviations, if residuals are normal
 CORRELATED = 2.0  # factor of standard deviations that take correlated errors for independent ones
-# A pose is moved so far to see whether its cost grows. The cost at a right pose grows in both
-# directions at this distance, but within 5 cm often in one direction alone.
+# A pose is moved so far to see whether its cost grows. In a room with a partition the cost at right
+# poses grew in both directions at this distance, but within 5 cm in one alone (docs/tried.md).
 _MOVED_M = 2 * WRONG_M
 
 

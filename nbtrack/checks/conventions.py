@@ -17,10 +17,10 @@ _CLEARLY_BETTER = 1.3  # ratio of two agreements (our choice)
 _NEARER = 3  # ratio of two mean gaps (our choice)
 _ALIKE = 0.95  # agreements above this share of the highest count as equal to it
 PLAUSIBLE_DEPTH = (0.2, 20.0)  # m; a median depth outside of this range has a wrong unit
-# The largest usual mean gap, as a share of the depth. Among 21 right recordings at hand the largest
-# is 0.0050 (a Kinect with poses of KinectFusion); a HoloLens has 0.0020, rendered rooms 0.0017.
-# Parts of the 36 frames of real_room have up to 0.0099, so that up to twice this is no evidence of
-# a mistake by itself.
+# The largest usual mean gap, as a share of the depth. Of the right recordings in
+# docs/tried.md a Kinect with poses of KinectFusion has the largest, 0.0048; a HoloLens has 0.0019,
+# rendered rooms at most 0.0019. The first 36 frames of that Kinect's alone have 0.0083, so that up
+# to twice this is no evidence of a mistake by itself.
 _USUAL_APART = 0.0055
 _USUAL_M = 0.025  # m; a larger gap is unusual at any depth
 MIN_OVERLAP = 0.15  # with a smaller share of points that overlap nothing is concluded (our choice)

@@ -47,7 +47,7 @@ _NUMBERS = {
     "focal_share": Number("by ", "+.1%", "", 0.5, 0.01),
     "depth_share": Number("by ", "+.1%", "", 0.5, 0.01),
     # Sensors with structured light have this error. In the paper's dataset it is 0.0012, and the
-    # estimates are up to 0.0035.
+    # estimates are up to 0.0038 (docs/tried.md).
     "depth_error_per_m": Number("of ", "+.5f", " per metre", 0.05, 5e-4, usual=4e-3),
     "depth_offset": Number("", "+.3f", " m", 0.5, 0.02),
     "right": Number("right by ", "+.1%", " of the width", 0.25, 0.005),
