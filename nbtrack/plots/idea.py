@@ -141,7 +141,8 @@ def _draw_queries(
     start = (points_camera @ page_camera.T).numpy()
     end = (ends_camera @ page_camera.T).numpy()
     axes.scatter(*start.T, s=20, label="measured points", color=_COLORS["true"], **_DOT)
-    # An entry in the legend, which cannot show the arrows.
-    axes.plot([], [], color=_COLORS["SDF"], label="|d| against the gradient")
+    # An entry in the legend, which cannot show the arrows of `quiver`.
+    arrow = {"marker": r"$\rightarrow$", "markersize": 18, "linestyle": "none"}
+    axes.plot([], [], color=_COLORS["SDF"], label="|d| against the gradient", **arrow)
     look = {"color": _COLORS["SDF"], "angles": "xy", "scale_units": "xy", "scale": 1, "zorder": 5}
     axes.quiver(*start.T, *(end - start).T, units="inches", width=0.022, **look)

@@ -41,7 +41,7 @@ def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
     skip = {"connectionstyle": "bar,fraction=-0.12", "patchA": boxes[1], "patchB": boxes[4]}
     axes.annotate("", (places[4], 0), (places[1], 0), arrowprops=_ARROW | skip)
     again = "sin(x B) once more, beside the output of the second layer"
-    axes.text(places[[1, 4]].mean(), 0.75, again, **_CENTRED)
-    axes.set(xlim=(0, places[-1] + widths[-1] / 2 + _GAP), ylim=(-0.4, 0.9))
+    axes.text(places[[1, 4]].mean(), 0.5, again, **_CENTRED)
+    axes.set(xlim=(0, places[-1] + widths[-1] / 2 + _GAP), ylim=(-0.4, 0.6))
     axes.set_axis_off()
     return axes.figure

@@ -64,11 +64,11 @@ def pose_losses(
 def plot_pose_losses(
     density: LearnedField, distance: Field, frame: Frame, x_cm: float = 0.0, y_deg: float = 0.0
 ) -> Figure:
-    """Both losses of `pose_losses` along x, and what the density renders at one pose.
+    """Both losses of `pose_losses` along x.
 
     Each loss has two curves: with the camera turned by `y_deg`, and a pale one without a turn. A
-    dot marks the pose that is moved by `x_cm` and turned, with the gradient as a line through it;
-    this pose is also rendered. For sliders:
+    dot marks the pose that is moved by `x_cm` and turned, with the gradient as a line through it.
+    For sliders:
     `interact(plot_pose_losses, density=fixed(...), ..., x_cm=(-20, 20), y_deg=(-10, 10))`.
     """
     straight = pose_losses(density, distance, frame)
@@ -76,12 +76,7 @@ def plot_pose_losses(
     sdf_cm, vr_cm = turned[[_SDF_LOSS, _VR_LOSS]].idxmin()
     title = f"Turned by {y_deg:g}°, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
     title += ": a turn is traded for a shift" if sdf_cm and vr_cm else ""
-    *panels, view = new_axes(title.replace("-", "−"), 2.9, 1, 3)[0]  # minus signs for hyphens
-    T_world_camera = move_sideways(frame, x_cm, y_deg).double().numpy()
-    rendered_color, _ = density.render_view(frame.camera, T_world_camera)
-    view.imshow(rendered_color)
-    view.set_title("the view from this pose")
-    view.axis("off")
+    panels = new_axes(title.replace("-", "−"), 2.9, 1, 2)[0]  # minus signs for hyphens
     tangent_cm = np.array([-5, 0, 5])  # offsets along x of three points on the tangent
     for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
         axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
@@ -94,10 +89,8 @@ def plot_pose_losses(
         axes.plot(x_cm + tangent_cm, loss + gradient * tangent_cm, color="0.3", **look)
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
-    figure = view.figure.legend_below()
-    for line in figure.legends[0].get_lines():
-        line.set_color("0.3")  # grey, since the legend is for the curves of both colours
-    return figure
+        axes.legend(loc="upper left")
+    return panels[0].figure
 
 
 @styled

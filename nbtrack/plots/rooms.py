@@ -18,7 +18,7 @@ from nbtrack.plots.scene import Paths
 from nbtrack.plots.style import method_colors, new_axes, styled
 from nbtrack.synthetic import Room
 
-_TRUE_LINE = {"colors": method_colors(["true"])["true"], "linestyles": "--"}
+_TRUE_LINE = {"color": method_colors(["true"])["true"], "linewidth": 1.1}
 
 
 @styled
@@ -31,9 +31,9 @@ def plot_slice(
 ) -> Figure:
     """The values of a field on a horizontal plane, `height` metres up, seen from above.
 
-    Several fields of one recording are drawn side by side, with the colour scale of the first.
+    Several fields of one recording are drawn side by side, with the colour scale of the last.
     `sequence` holds the frames that the maps were made from; the default `height` is the mean of
-    its cameras. If the exact `room` is known, its surface is a dashed green line, and its exact
+    its cameras. If the exact `room` is known, its surface is a thin green line, and its exact
     distance is drawn before the fields. The axes cover the camera path and what the frames have
     seen (inside the room). Spots that only a few rays have seen count as not seen.
     """
@@ -41,18 +41,19 @@ def plot_slice(
     if room is not None and drawn[0].is_distance:
         drawn.insert(0, ExactDistance(room, drawn[0]))
     panels = new_axes(title, 5.4 - 0.8 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
-    norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # those of the first, for all
+    norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # those of the last, for all
     of_cameras = (sequence.T_world_camera[:, :3, 3] @ scene.up_of(sequence.T_world_camera)).mean()
     height = of_cameras if height is None else height
     above = f", {of_cameras - height:.1f} m higher up" if abs(of_cameras - height) > 0.05 else ""
-    for axes, field in zip(panels, drawn, strict=True):
+    for axes, field in zip(panels[::-1], drawn[::-1], strict=True):
         up, page = scene.draw_from_above(axes, {f"cameras{above}": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / 240  # m
         points, places = _level_grid(page, low, high + step, step, height * up)
         is_seen = binary_opening(seen_by(points, sequence), iterations=2)  # without small spots
         norm = scene.draw_slice(axes, field, points, places, is_seen, norm, **bar)
-        what = f": {field.value_label.partition(' ')[0]} of {field.surface_level:g}"
+        name, _, unit = field.value_label.partition(" ")
+        what = f": {name} of {field.surface_level:g}{unit.strip('(1)')}"
         # Without points: an entry in the legend for the surface that `draw_slice` drew.
         axes.plot([], [], "k-", label="surface" if field.is_distance else f"surface{what}")
         if room is not None:
@@ -64,10 +65,11 @@ def plot_slice(
 
 
 def _draw_true_level(axes: Axes, room: Room, points: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Draw a room's true surface on a slice, dashed; returns which points lie in free space."""
+    """Draw a room's true surface on a slice; returns which points lie in free space."""
     sdf = room.sdf(points.reshape(-1, 3)).reshape(points.shape[:2])
-    scene.draw_levels(axes, places, sdf, [0.0], zorder=3, **_TRUE_LINE)
-    axes.plot([], [], "--", color=_TRUE_LINE["colors"], label="true surface")
+    look = {"colors": _TRUE_LINE["color"], "linewidths": _TRUE_LINE["linewidth"], "zorder": 3}
+    scene.draw_levels(axes, places, sdf, [0.0], **look)
+    axes.plot([], [], label="true surface", **_TRUE_LINE)
     return sdf > 0
 
 
@@ -102,7 +104,7 @@ def plot_mesh(meshes: Mapping[str, trimesh.Trimesh], T_paths: Paths, title: str 
     parallel; horizontal lengths in the picture are true (m). `T_paths` are camera-to-world poses
     (m) by label; "true" is green, "tracked" red.
     """
-    panels = new_axes(title, 5.0 - 0.4 * len(meshes), 1, len(meshes), sharex=True, sharey=True)[0]
+    panels = new_axes(title, 5.2 - 0.6 * len(meshes), 1, len(meshes), sharex=True, sharey=True)[0]
     to_screen = None  # the view of the first mesh, which the others share
     for axes, (label, mesh) in zip(panels, meshes.items(), strict=True):
         to_screen = scene.draw_mesh(axes, mesh, scene.up_of(*T_paths.values()), to_screen)
@@ -126,7 +128,8 @@ def plot_map_and_slice(
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    room, level, errors = new_axes(title, 3.3, 1, 3, width_ratios=[1.3, 1.3, 0.9])[0]
+    room, level, errors = new_axes(title, 3.2, 1, 3, width_ratios=[1.3, 1.3, 1.1])[0]
+    room.figure.get_layout_engine().set(wspace=0.08)
     level.sharex(room)
     level.sharey(room)
     to_page = scene.draw_mesh(room, mesh, up)[:2]

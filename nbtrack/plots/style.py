@@ -21,7 +21,7 @@ _LABELS = (  # the labels that have each colour of the palette in all figures
     ("iMAP with VR", "iMAP", "VR"),
     ("NeuS with SDF", "NeuS", "SDF", "NeuS+ with SDF (Adam)"),
     ("NeuS+ baked (LM)", "NeuS+", "LM"),
-    ("NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map"),
+    ("NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map", "greedy"),
     # Rates have colours that belong to no method of the same figure.
     ("ICP", "at 5 Hz"),
     ("NeuS+ grid", "at 10 Hz"),
