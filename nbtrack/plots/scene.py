@@ -185,8 +185,7 @@ def draw_slice(
     xy = np.moveaxis(places, -1, 0)  # matplotlib takes two arrays of coordinates
     image = axes.pcolormesh(*xy, values, cmap=colors, norm=norm or own_norm, **look)
     if norm is None:
-        bar = {"ax": axes, "label": field.value_label, "extend": "both", **bar}
-        axes.figure.colorbar(image, **bar)
+        axes.figure.colorbar(image, extend="both", **{"ax": axes, "label": field.value_label} | bar)
     if field.is_distance:
         # Lines are white where the slice is dark.
         tones = ["1" if abs(line) > 0.6 * image.norm.vmax else "0.35" for line in _LINES_M]
