@@ -1,4 +1,4 @@
-"""The experiments behind notebooks 5, A1, A2 and A3, each of which adds rows to a CSV.
+"""The experiments behind notebooks 5, A1, A2, A3 and A6, each of which adds rows to a CSV.
 
     python benchmarks/evidence.py EXPERIMENT [SEEDS]
 

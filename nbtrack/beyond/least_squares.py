@@ -90,7 +90,7 @@ def solve(
 
     Iteratively reweighted least squares: each of the `rounds` computes the weights at the solution
     so far, and solves by conjugate gradients from there. The Hessian A'WA + R is applied to
-    vectors, and never formed: to sum up its entries would take several times as long. Its diagonal
+    vectors, and never formed: to sum up its entries would take longer. Its diagonal
     is returned for the weights of the last round.
     """
     solution = np.zeros((matrix.shape[1], wanted.shape[1]))

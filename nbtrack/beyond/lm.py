@@ -126,8 +126,7 @@ class LmTracker(Tracker):
         self.is_converged = n_points < _MIN_POINTS
         if self.is_converged:
             return
-        # A descent begins on a part of the points, and ends on all of them. Far from the pose a
-        # part is as good, and faster.
+        # A descent begins on a part of the points, which takes less time, and ends on all of them.
         coarse = with_normals(frame, observed, max(128, n_points // 8))
         # A picture without contrast is dark, covered or overexposed: its intensities are not used.
         has_contrast = observed.intensity.std() > 0.01

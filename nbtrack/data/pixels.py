@@ -15,7 +15,7 @@ from nbtrack.machinery.inputs import tensor_of
 
 # The neighbours that a pixel's tangent plane is computed from (our choice): how far away they are,
 # as a share of the image's width, and by what share of the pixel's depth they may differ from it.
-# This leaves out pixels at edges, and surfaces seen at more than some 75 degrees from their normal.
+# This leaves out pixels at edges, and surfaces seen at more than some 79 degrees from their normal.
 PLANE_REACH = 1 / 64
 PLANE_JUMP = 0.1
 

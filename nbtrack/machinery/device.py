@@ -94,8 +94,7 @@ def usual_modes() -> Iterator[None]:
 def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:
     """Run a block with matrix products in full single precision, or with `tf32` in TF32.
 
-    Only NVIDIA's GPUs have TF32. It keeps 10 of the mantissa's 23 bits and is several times as
-    fast.
+    Only NVIDIA's GPUs have TF32. It keeps 10 of the mantissa's 23 bits and takes less time.
     """
     return _changed("float32_matmul_precision", "high" if tf32 else "highest")
 

@@ -3,7 +3,7 @@
 The reach is how far a frame's steps can move the camera. Adam with a fresh state moves a coordinate
 by about its learning rate in each step, whatever the size of the gradient, as long as the gradient
 keeps its sign. So N steps end within N times the rate of their start, along each axis. A camera
-that moves farther in a frame is left behind, whatever the map, the pixels and the loss are. Source:
+that keeps moving farther is left behind, whatever the map, the pixels and the loss are. Source:
 paper, implementation details (rates), and Kingma & Ba 2015, Sec. 2.1 (the bound of a step).
 """
 
