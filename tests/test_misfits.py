@@ -136,6 +136,15 @@ def interval(report: DataReport) -> tuple[float, float]:
     return found.numbers["depth_error_per_m"][1:]
 
 
+@pytest.mark.parametrize(("n_frames", "stride"), [(24, 6), (40, 10)])
+def test_late_depth_of_a_fast_camera_is_told(tmp_path: Path, n_frames: int, stride: int) -> None:
+    """Catches a large misfit that is not looked for in few frames, and a cause that explains all,
+    but for which numbers of other causes leave a smaller share of nearly nothing."""
+    data = depth(lambda d: late(d, 1))(source("living_room", n_frames, stride))
+    (said,) = warnings_of(tmp_path / "r", data)
+    assert said.startswith("depth comes after the poses by +1.0 ")
+
+
 def test_no_fit_ends_where_nothing_is_known() -> None:
     """Catches a fit that ends where the two images of a pair share nothing, as if all were well."""
     assert cost_of(np.full((2, 3), np.nan)) > cost_of(np.full((2, 3), 0.5))

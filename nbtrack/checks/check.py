@@ -114,9 +114,11 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     conventions, best = fit_all(frame_pairs, as_declared)
     cloud = _cloud(as_declared, sequence)
     is_far = cloud.depth > far_limit(cloud.depth)
-    # A small misfit can only be told if poses and depths are read rightly otherwise.
+    # A misfit can only be told if poses and depths are read rightly otherwise, and a small one only
+    # with many frames.
     declared_is_best = best is conventions[0]
-    has_enough = len(ids) >= _MIN_FRAMES and best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
+    is_large_or_proved = len(ids) >= _MIN_FRAMES or conventions[0].is_far_apart
+    has_enough = is_large_or_proved and best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
     causes = ProgressBar("fitting", CAUSES.items() if declared_is_best and has_enough else [])
     misfits = [fit(frame_pairs, as_declared, as_declared, name, keys) for name, keys in causes]
     main = main_misfits(frame_pairs, as_declared, misfits)

@@ -22,9 +22,10 @@ _ENOUGH = 0.02  # a step ends the fit if it changes each number by less than thi
 _MAX_COST_LEFT = 0.75  # our choice
 _MAX_COST_LEFT_USUAL = 0.9  # our choice, for errors that usual sensors have
 _ALIKE = 0.95  # two costs count as equal if their ratio is at least this
-# No single cause is the whole explanation if all numbers together leave less than this share of the
-# cost that the best cause leaves.
-_WHOLE = 0.8
+# No single cause is the whole explanation if all numbers together leave clearly less cost than the
+# best cause does: less than this share of it, and less by so much. Of a cost near 0 a share says
+# nothing (our choice).
+_WHOLE, _CLEARLY = 0.8, 0.05
 _RESAMPLED = 200  # draws of the bootstrap
 Hessians = Float[np.ndarray, "... k k"]
 Gradients = Float[np.ndarray, "... k"]
@@ -124,7 +125,7 @@ def main_misfits(pairs: FramePairs, as_declared: Reading, misfits: list[Misfit])
     lowest = min(misfit.cost_left for misfit in significant)
     first, *others = (m for m in significant if _ALIKE * m.cost_left <= lowest)
     all_numbers = fit(pairs, as_declared, first.reading, "all", list(_NUMBERS))
-    if all_numbers.cost_left < _WHOLE * lowest:
+    if all_numbers.cost_left < min(_WHOLE * lowest, lowest - _CLEARLY):
         return []
     return [first, *(other for other in others if not first.numbers.keys() <= other.numbers.keys())]
 
