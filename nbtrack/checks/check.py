@@ -18,6 +18,7 @@ from nbtrack.data.sequence import ARRAYS, RgbdSequence
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.images import images_of
+from nbtrack.recordings.pose_files import shifted
 from nbtrack.recordings.reading import far_limit, read_frames, select_frames
 from nbtrack.recordings.recording import Recording
 
@@ -100,8 +101,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     `read_frames` does, and DataError if `is_whole` and no pixel has a depth.
     """
     ids = select_frames(recording, slice(None))
-    T_world_camera = recording.T_world_camera[ids]
-    T_world_camera[:, :3, 3] -= recording.origin
+    T_world_camera = shifted(recording.T_world_camera[ids], -recording.origin)
     pairs = _pairs(T_world_camera, _N_PAIRS if is_whole else _QUICK_PAIRS)
     paired_ids = ids[np.union1d(pairs, [0])]  # the first frame, too: the cloud needs at least one
     sequence, frames, counts = _read(recording, ids if is_whole else paired_ids, paired_ids)
@@ -114,11 +114,10 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     conventions, best = fit_all(frame_pairs, as_declared)
     cloud = _cloud(as_declared, sequence)
     is_far = cloud.depth > far_limit(cloud.depth)
-    # A misfit can only be told if poses and depths are read rightly otherwise, and a small one only
-    # with many frames.
+    # A misfit is told only of what is read rightly otherwise, and a small one of many frames only.
     declared_is_best = best is conventions[0]
-    is_large_or_proved = len(ids) >= _MIN_FRAMES or conventions[0].is_far_apart
-    has_enough = is_large_or_proved and best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
+    has_enough = len(ids) >= _MIN_FRAMES or conventions[0].is_far_apart
+    has_enough &= best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
     causes = ProgressBar("fitting", CAUSES.items() if declared_is_best and has_enough else [])
     misfits = [fit(frame_pairs, as_declared, as_declared, name, keys) for name, keys in causes]
     main = main_misfits(frame_pairs, as_declared, misfits)
