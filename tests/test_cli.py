@@ -23,6 +23,7 @@ from tiny import tiny_words
 
 from nbtrack import load_preset, open_scene, read_map
 from nbtrack.cli import COMMANDS, main
+from nbtrack.experiments import runs as run_files
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.files import naming_damaged, runs_folder
@@ -144,6 +145,19 @@ def test_a_recording_without_poses_is_tracked_in_a_map(work: Path, capsys, monke
     assert "in another world than the map" in capsys.readouterr().err
     assert json.loads((work / "elsewhere/metrics.json").read_text())["median_error_m"] < 0.05
     assert (work / "elsewhere/groundtruth.txt").is_file()
+    # Of two frames one pose is known: no motion can explain its error, and none stands still.
+    known = np.loadtxt(recording / "poses.txt")
+    known[4:] = np.nan
+    np.savetxt(recording / "poses.txt", known)
+    titles = []
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            run_files, "save_picture", lambda drawn, *_, **__: titles.append(drawn.get_suptitle())
+        )
+        assert main([*elsewhere, "--start", "unknown", "--frames", ":2"]) == 0
+    assert "no rigid motion" in capsys.readouterr().err
+    assert "cm" in titles[0]
+    assert "nan" not in titles[0]
     for name in ("poses.txt", "trainval_poses.txt"):
         (recording / name).unlink()
     assert main(elsewhere) == 0

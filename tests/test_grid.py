@@ -22,8 +22,10 @@ from tiny import tiny_words
 
 from nbtrack.cli import main
 from nbtrack.experiments.jobs import Execution, Job, Report, run_jobs
+from nbtrack.experiments.workers import processes
 from nbtrack.machinery.errors import DataError
 
+_MAIN = os.getpid()  # of this process, also in workers, which are forked
 # Dask's own threads and sockets warn as they are torn down.
 pytestmark = pytest.mark.filterwarnings("default")
 
@@ -38,6 +40,7 @@ class Square(Job):
     is_done: bool = False
     kind, key = "squares", "0"
     name = property(lambda self: f"square {self.number}")
+    is_timed = property(lambda self: self.how == "alone")
 
     def result(self) -> int:
         return self.number**2
@@ -45,6 +48,8 @@ class Square(Job):
     def compute(self, report: Report) -> int:
         if self.how == "badly":
             raise DataError(f"depth{self.number}.png is empty")
+        if self.how == "alone" and os.getpid() != _MAIN:
+            raise DataError("it runs beside others")
         if self.how == "deadly":
             os._exit(1)
         end = time.monotonic() + (1.5 if self.how == "slowly" else 0.0)
@@ -76,9 +81,12 @@ def execution(request, address: str):
 
 
 def test_results_come_in_order(execution: dict, capsys) -> None:
-    """Catches results in the order of their completion, twins computed twice, and early noise."""
+    """Catches results in the order of their completion, twins computed twice, early noise, and jobs
+    that are timed while others run."""
     jobs = [Square(3), Square(1, needs=Square(4)), Square(3), Square(5, is_done=True)]
     assert run_jobs(jobs, Execution(**execution)) == [9, 1, 9, 25]
+    timed = [Square(2, "alone", needs=Square(3)), Square(5, "alone", needs=Square(4))]
+    assert run_jobs(timed, Execution(**execution)) == [4, 25]
     if execution == {"workers": 1}:
         assert capsys.readouterr().err == ""
 
@@ -181,6 +189,17 @@ def test_no_scheduler(address: str, capsys, monkeypatch, tmp_path: Path) -> None
     monkeypatch.setattr("nbtrack.experiments.workers._SECONDS_TO_CONNECT", 0.5)
     assert tables(tmp_path, "--dask", address) == 2
     assert f"no Dask scheduler at {address!r}" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_handler_that_is_not_pythons(monkeypatch) -> None:
+    """Catches Ctrl-C that is ignored for good, once a worker began, where Python does not know the
+    handler, as in a program that embeds it."""
+    handlers = [None]
+    monkeypatch.setattr(signal, "getsignal", lambda number: handlers[-1])
+    monkeypatch.setattr(signal, "signal", lambda _, new: handlers.append(new) or handlers[-2])
+    with processes(1) as workplace:
+        workplace.begin()
+    assert handlers[-1] is None
 
 
 # To the whole group, as a terminal does; a shell's background jobs ignore it.

@@ -173,6 +173,8 @@ def test_names_that_are_no_formulas(tmp_path: Path) -> None:
         with matplotlib.rc_context(settings):
             figure = plots.plot_curves(SWEEP, *SWEEP, "a$^$b 録画: 3 frames")
             save_picture(figure, tmp_path / "picture.png")
+    _, described = figure._repr_mimebundle_()
+    assert described["image/png"]["alt"] == "a$^$b 録画: 3 frames"
     assert (tmp_path / "picture.png").stat().st_size > 1000
 
 
@@ -245,7 +247,10 @@ def test_poses_that_are_not_known_leave_gaps(sequence) -> None:
     T_true = sequence.T_world_camera.copy()
     T_true[2] = np.nan
     paths = {"tracked": sequence.T_world_camera, "true": T_true}
-    figure = plots.plot_map_and_slice(NEAR, sequence, paths, voxel=0.1)
+    partly_known = replace(sequence, T_world_camera=T_true)
+    assert "nan" not in plots.plot_slice(NEAR, partly_known).axes[0].get_title()
+    figure = plots.plot_map_and_slice(NEAR, partly_known, paths, voxel=0.1)
+    assert figure.axes[1].collections[0].get_array().count() > 0  # some of the slice is seen
     (off_mm,) = figure.axes[2].lines
     assert np.flatnonzero(np.isnan(off_mm.get_ydata())).tolist() == [2]
     low = CLOUD - [0, 9, 0, 0, 0, 0]  # below the cameras

@@ -59,6 +59,8 @@ def test_precedence(tmp_path: Path, monkeypatch) -> None:
     before = copy.deepcopy(PRESETS)
     assert load_preset() == PRESETS["smoke"]
     with monkeypatch.context() as patch:
+        patch.setenv("NBTRACK_PRESET", "")  # as not set
+        assert load_preset() == PRESETS["smoke"]
         patch.setenv("NBTRACK_PRESET", "synthetic")
         assert load_preset() == PRESETS["synthetic"]
         assert load_preset("paper") == PRESETS["paper"]

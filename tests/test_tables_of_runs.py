@@ -18,7 +18,7 @@ from nbtrack.beyond.correction import CorrectedField
 from nbtrack.beyond.points import PointCloud
 from nbtrack.cli import main
 from nbtrack.experiments.bench import default_pixels, measure_steps
-from nbtrack.experiments.jobs import Execution
+from nbtrack.experiments.jobs import Execution, Report
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.scenes import Scene
@@ -114,7 +114,7 @@ def test_maps_and_their_scores(preset, scenes: list[Scene]) -> None:
     assert len(found.history) == 6
 
 
-def test_budgets(preset, scenes: list[Scene]) -> None:
+def test_budgets(preset, scenes: list[Scene], monkeypatch) -> None:
     """Steps of the paper's hardware, so many steps, or the clock: then no step count at all."""
     by_steps = track_scenes(scenes[1:], ["vr_neus", "sdf"], preset, [10])
     assert by_steps["steps"].tolist() == [6.8, 15.3]
@@ -124,6 +124,17 @@ def test_budgets(preset, scenes: list[Scene]) -> None:
     clock = track_scenes(scenes[1:], ["sdf"], preset, [10], clock=True)
     assert "wall clock" in clock["budget"][0]
     assert clock["steps"].isna().all()
+    tried = []
+
+    def fail(job: MapJob, report: Report) -> None:
+        tried.append(job.name)
+        raise DataError("it diverges")
+
+    monkeypatch.setattr(MapJob, "compute", fail)
+    on = Execution(workers=1, keep_going=True)
+    failed = track_scenes(scenes[1:], ["sdf"], preset, [10], clock=True, seeds=[9], execution=on)
+    assert "it diverges" in failed["failure"][0]
+    assert len(tried) == 1  # no second time for the run
 
 
 def test_table_3(tmp_path: Path, coarse_methods: None, monkeypatch) -> None:

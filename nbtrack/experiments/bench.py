@@ -109,15 +109,15 @@ def _label_of(text: str) -> tuple[str, str]:
 
 
 def bench_command(options: Namespace) -> None:
-    """Measure and print Table II; write it as CSV."""
+    """Measure Table II; print it, and write it as CSV."""
     # Networks have the paper's sizes by default: with small ones the time of a step is overhead.
-    name = options.preset or os.environ.get("NBTRACK_PRESET", "synthetic")
+    name = options.preset or os.environ.get("NBTRACK_PRESET") or "synthetic"
     # A step costs the same whatever the images and the weights of the map are. So the room has the
     # fewest images that are allowed, and the map is hardly trained.
     quick = ("scenes.n_frames=2", "mapping.imap.iterations=1", "mapping.neus.iterations=1")
     preset = load_preset(name, options.config, [*options.settings, *quick])
     prepare(options.out)
-    steps = _table_2(preset, open_scene(preset.scenes.names[0], preset))
+    steps = _table_2(preset, open_scene(preset.scenes.names[0], preset))  # prints the table
     folder = options.out or runs_folder() / "bench" / preset.name
     print(tables.write_csv(folder / "table_2.csv", steps))
 

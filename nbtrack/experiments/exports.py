@@ -25,8 +25,8 @@ from nbtrack.recordings.pose_files import number_lines, read_tum, shifted
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.tracking import Trajectory
 
-_FRAMES_SHOWN = 20  # an overview shows what at least so many frames of a longer run saw
-_CELLS = 120  # of an overview's mesh, in two units of the map
+_FRAMES_SHOWN = 20  # an overview shows what every n-th frame saw, n such that 20 or more are used
+_CELLS = 120  # of an overview's mesh, along two map units
 _MOVIE_FRAMES = 100  # at most so many, evenly spread over a run
 
 
@@ -48,8 +48,9 @@ def draw_overview(run: TrackJob) -> None:
     surface.apply_translation(origin)  # pictures, as files, are in the recording's world
     paths = {}
     if "ate_rmse_m" in metrics:
-        ate_m, still_m = metrics["ate_rmse_m"], metrics.get("still_ate_m", np.nan)
-        title += f", ATE {100 * ate_m:.2f} cm (standing still {100 * still_m:.0f} cm)"
+        title += f", ATE {100 * metrics['ate_rmse_m']:.2f} cm"
+        if "still_ate_m" in metrics:  # it needs two true poses
+            title += f" (standing still {100 * metrics['still_ate_m']:.0f} cm)"
         is_known = np.isfinite(tracked.T_true).all(axis=(1, 2))
         paths["true"] = shifted(tracked.T_true[is_known], origin)
     paths["tracked"] = shifted(tracked.T_estimated, origin)

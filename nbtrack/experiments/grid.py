@@ -1,7 +1,6 @@
 """Map and track scenes by many methods; results are DataFrames, and what is cached is reused."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -70,7 +69,7 @@ def track_scenes(
         tracked: recordings to track instead of the mapped ones, of the same rooms in this order.
 
     Returns a row for each run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the
-    metrics, ate_m (NaN if unknown), failure (reason or empty). Raises ConfigError; then as jobs do.
+    metrics, ate_m (NaN if unknown), failure. Raises ConfigError, and what `run_jobs` raises.
     """
     pairs = _pairs(scenes, scenes if tracked is None else tracked, preset, seeds)
     rates, steps = _rates(preset.tables.rates_hz, rates_hz, steps, clock)
@@ -79,15 +78,15 @@ def track_scenes(
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         tracker, with_method = method.tracker, preset.with_method(method.settings)
         settings = with_method.tracking_of(tracker)
-        n_steps = steps if rate_hz is None or clock else method.paper_steps(rate_hz)
-        clock_hz = rate_hz if clock else None  # `n_steps` is None then
+        n_steps = steps if rate_hz is None else None if clock else method.paper_steps(rate_hz)
+        clock_hz = rate_hz if clock else None
         make_budget(n_steps, clock_hz)  # raises for a wrong number, before anything is made
         map_job = MapJob.of(scene, method.field, with_method, seed=seed)
-        job = TrackJob(map_job, seen, tracker, settings, n_steps, clock_hz, frames, map_job.seed)
+        job = TrackJob(map_job, seen, tracker, settings, n_steps, clock_hz, frames, seed)
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
         rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": settings.n_pixels})
-    return pd.DataFrame(map(_row_of, rows, _run(jobs, clock, execution or Execution())))
+    return pd.DataFrame(map(_row_of, rows, _run(jobs, execution)))
 
 
 def _pairs(scenes: Sequence, tracked: Sequence, preset: Preset, seeds: Any = (0,)) -> list[tuple]:
@@ -131,20 +130,13 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
     return {**metrics, **row, "failure": "", "ate_m": metrics.get("ate_rmse_m", float("nan"))}
 
 
-def _run(jobs: Sequence[TrackJob], clock: bool, execution: Execution) -> list[Any]:
-    """Run jobs side by side; returns their results.
-
-    With `clock`, only the maps are made side by side. The runs follow one after the other, since
-    other work at the same time would leave them fewer steps.
-    """
+def _run(jobs: Sequence[TrackJob], execution: Execution | None) -> list[Any]:
+    """Run jobs after a check of their frames, and warnings; returns their results."""
     missing = [job for job in jobs if not job.is_done]
     for job in missing:
         job.scene.select(job.frames, needs_poses=False)  # raises before anything is mapped
     for warning in reach_warnings(missing):
         tell(f"nbtrack: warning: {warning}")
-    if clock:
-        run_jobs([job.needs for job in missing], execution)
-        execution = replace(execution, workers=1, dask=None)
     return run_jobs(jobs, execution)
 
 

@@ -52,6 +52,7 @@ class Job:
     key: str  # a digest that changes with everything that the result depends on
     doing: str = "computing"  # the title of the progress bar
     work: float = 1.0  # how long the job takes, relative to a tracked run: its weight in the bar
+    is_timed: bool = False  # whether work at the same time would change its result
     needs: "Job | None"  # the job whose result this one is made from
     is_done: bool
     result: Callable[[], Any]  # reads the result of a finished job
@@ -76,9 +77,9 @@ class Job:
         process ends.
         """
         report(0.0, "begins, or waits for another process that makes the same")
-        check_no_recording(self.lock)
-        setting = f"the frames and settings of {self.name}"
-        with locked(self.lock), device.usual_modes(), device.advise_on_memory(setting):
+        check_no_recording(self.lock)  # NBTRACK_RUNS may lie in a recording
+        to_lower = f"the frames and settings of {self.name}"
+        with locked(self.lock), device.usual_modes(), device.advise_on_memory(to_lower):
             report(0.0, "running")
             return self.result() if self.is_done else self.compute(report)
 
@@ -134,7 +135,8 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
     # When the block ends, also by an error, the workers end at once.
     with bar, _workplace(execution, max(map(len, waves), default=0)) as workplace:
         for wave in waves:
-            for folder, outcome in _outcomes(wave, outcomes, show, workplace):
+            place = None if any(job.is_timed for job in wave.values()) else workplace
+            for folder, outcome in _outcomes(wave, outcomes, show, place):
                 settle(folder, outcome)
                 show({folder: (0.0, "done")})
     for job in jobs:

@@ -229,7 +229,7 @@ def load_preset(
     does not exist; DataError if it is no TOML.
     """
     check_lists(settings=settings, of_method=of_method)
-    preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET", "smoke"), PRESETS)
+    preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET") or "smoke", PRESETS)
     config_file = config_file or os.environ.get("NBTRACK_CONFIG")
     if config_file:
         config_file = absolute(config_file)

@@ -28,7 +28,7 @@ from nbtrack.machinery.registry import IMPORTED
 from nbtrack.machinery.settings import as_dict, changed_settings
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
-from nbtrack.tracking.metrics import still_metrics
+from nbtrack.tracking.metrics import LOST_THRESHOLD_M, still_metrics
 from nbtrack.tracking.reach import reach_metrics
 from nbtrack.tracking.starts import expected_poses
 from nbtrack.tracking.tracker import TrackerSettings
@@ -37,6 +37,10 @@ RUN_FILE = "run.pt"
 _OTHER_WORLD = (
     "the recording's poses are in another world than the map: they were moved into it by the one "
     "rigid motion that explains the difference, and errors are those that remain"
+)
+_UNEXPLAINED = (
+    "the recording does not fit the map, and no rigid motion of its poses explains that: it is of "
+    "another place, the camera was not found, or too few poses are known; errors mean nothing"
 )
 # A user is warned before a run if one of these numbers is larger (our choice). Smaller ones do no
 # harm: a hand starts and stops, and the search catches up.
@@ -81,6 +85,11 @@ class TrackJob(Job):
         elsewhere = "-unmapped" if self.is_elsewhere else ""
         name = f"{self.scene.name}-{self.needs.field}-{self.tracker}{elsewhere}-{budget}"
         return f"{name}-seed{self.seed}" if self.seed else name
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether it tracks by the clock: other work beside it would leave it fewer steps."""
+        return self.rate_hz is not None
 
     @property
     def is_elsewhere(self) -> bool:
@@ -153,7 +162,9 @@ class TrackJob(Job):
         notes["device"] = device_name(tracker.device)  # the CPU for LM and ICP
         if warning == _OTHER_WORLD:  # moves the true poses into the map's world, for the errors
             tracked, is_explained = in_world_of_map(tracked)
-            notes["map_warning"] = warning if is_explained else None
+            # The first frame alone may be off, as where the map does not reach; NaN fits nothing.
+            fits = tracked.frames["translation_error_m"].median() <= LOST_THRESHOLD_M
+            notes["map_warning"] = warning if is_explained else None if fits else _UNEXPLAINED
         metrics = scores_of(tracked) | self._provenance(finished) | notes
         write_run(self.folder, replace(tracked, metrics=metrics))
         checkpoint.unlink(missing_ok=True)

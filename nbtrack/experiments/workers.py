@@ -78,7 +78,10 @@ def _spared() -> Iterator[None]:
     script = sys.modules["__main__"]
     # Only the main thread may set a handler of signals.
     is_main = threading.current_thread() is threading.main_thread()
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN) if is_main else None
+    # None also stands for a handler that is not Python's, which could not be restored.
+    handler = signal.getsignal(signal.SIGINT) if is_main else None
+    if handler is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.modules["__main__"] = ModuleType("__main__")
     try:
         yield

@@ -42,11 +42,12 @@ def plot_slice(
         drawn.insert(0, ExactDistance(room, drawn[0]))
     panels = new_axes(title, 5.4 - 0.8 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
     norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # those of the last, for all
-    of_cameras = (sequence.T_world_camera[:, :3, 3] @ scene.up_of(sequence.T_world_camera)).mean()
+    T_world_camera = sequence.T_world_camera
+    of_cameras = np.nanmean(T_world_camera[:, :3, 3] @ scene.up_of(T_world_camera))
     height = of_cameras if height is None else height
     above = f", {of_cameras - height:.1f} m higher up" if abs(of_cameras - height) > 0.05 else ""
     for axes, field in zip(panels[::-1], drawn[::-1], strict=True):
-        up, page = scene.draw_from_above(axes, {f"cameras{above}": sequence.T_world_camera})
+        up, page = scene.draw_from_above(axes, {f"cameras{above}": T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / 240  # m
         points, places = _level_grid(page, low, high + step, step, height * up)
@@ -60,7 +61,7 @@ def plot_slice(
             is_seen = is_seen & _draw_true_level(axes, room, points, places)
         axes.plot([], [], "s", color=scene.UNSEEN, label="hardly or never seen")
         axes.set_title(f"{field.label}, {height:.2f} m up")
-        _end_around(axes, places[is_seen], sequence.T_world_camera[:, :3, 3] @ page.T)
+        _end_around(axes, places[is_seen], T_world_camera[:, :3, 3] @ page.T)
     return panels[0].figure.legend_below()
 
 
@@ -75,9 +76,10 @@ def _draw_true_level(axes: Axes, room: Room, points: np.ndarray, places: np.ndar
 
 def _end_around(axes: Axes, *places: np.ndarray) -> None:
     """Limit axes to 0.1 m around places on the page (n, 2), and leave labels to outer axes."""
-    x, y = np.concatenate(places).T
-    axes.set_xbound(x.min() - 0.1, x.max() + 0.1)
-    axes.set_ybound(y.min() - 0.1, y.max() + 0.1)  # unlike set_ylim, this keeps an inverted axis
+    ends = np.concatenate(places)
+    (left, low), (right, high) = np.nanmin(ends, axis=0) - 0.1, np.nanmax(ends, axis=0) + 0.1
+    axes.set_xbound(left, right)
+    axes.set_ybound(low, high)  # unlike set_ylim, this keeps an inverted axis
     axes.label_outer()
 
 
@@ -128,43 +130,33 @@ def plot_map_and_slice(
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    room, level, errors = new_axes(title, 3.2, 1, 3, width_ratios=[1.3, 1.3, 1.1])[0]
-    room.figure.get_layout_engine().set(wspace=0.08)
-    level.sharex(room)
-    level.sharey(room)
-    to_page = scene.draw_mesh(room, mesh, up)[:2]
+    left, middle, right = new_axes(title, 3.2, 1, 3, width_ratios=[1.3, 1.3, 1.1])[0]
+    left.figure.get_layout_engine().set(wspace=0.08)
+    middle.sharex(left)
+    middle.sharey(left)
+    to_page = scene.draw_mesh(left, mesh, up)[:2]
     paths = {label: path[:, :3, 3] for label, path in T_paths.items()}
-    height = (sequence.T_world_camera[:, :3, 3] @ up).mean()
-    points = _level_points(np.concatenate([mesh.bounds, *paths.values()]), voxel, up, height)
+    height = np.nanmean(sequence.T_world_camera[:, :3, 3] @ up)
+    level = np.eye(3)[up == 0]  # the world's horizontal axes: `up` is a signed axis of the world
+    places = np.concatenate([mesh.bounds, *paths.values()]) @ level.T
+    low, high = np.nanmin(places, axis=0) - voxel, np.nanmax(places, axis=0) + 2 * voxel
+    points, _ = _level_grid(level, low, high, voxel, height * up)
     is_seen = seen_by(points, sequence)
     # The colour bar is that of both panels, so that they keep the same size.
-    bar = {"ax": [room, level], "shrink": 0.7, "aspect": 25}
-    scene.draw_slice(level, field, points, points @ to_page.T, is_seen, **bar)
-    level.set_axis_off()
-    level.set_aspect("equal")
-    for axes, name in (room, "surface: the zero level"), (level, "slice at the cameras' height"):
+    bar = {"ax": [left, middle], "shrink": 0.7, "aspect": 25}
+    scene.draw_slice(middle, field, points, points @ to_page.T, is_seen, **bar)
+    middle.set_axis_off()
+    middle.set_aspect("equal")
+    for axes, name in (left, "surface: the zero level"), (middle, "slice at the cameras' height"):
         scene.draw_paths(axes, T_paths, to_page, 0.7)
         axes.set_title(name)
-    scene.draw_scale(room, level)
+    scene.draw_scale(left, middle)
     first, *others = paths
     for label in others:
         off_mm = 1000 * np.linalg.norm(paths[label] - paths[first], axis=1)
-        errors.plot(off_mm, color=method_colors(paths)[label])
-    errors.set(title="error", xlabel="frame", ylabel=f"off the {first} path (mm)", ylim=(0, None))
-    return room.figure.legend_below()
-
-
-def _level_points(inner: np.ndarray, step: float, up: np.ndarray, height: float) -> np.ndarray:
-    """A grid of points (rows, columns, 3; m, world frame) on a horizontal plane at a height (m).
-
-    The grid reaches beyond all points of `inner` (n, 3; m), whatever their height. Points with NaN
-    are ignored, such as those of unknown poses.
-    """
-    level = np.eye(3)[up == 0]  # the two horizontal axes of the world
-    places = inner @ level.T
-    low, high = np.nanmin(places, axis=0) - step, np.nanmax(places, axis=0) + 2 * step
-    points, _ = _level_grid(level, low, high, step, height * up)
-    return points
+        right.plot(off_mm, color=method_colors(paths)[label])
+    right.set(title="error", xlabel="frame", ylabel=f"off the {first} path (mm)", ylim=(0, None))
+    return left.figure.legend_below()
 
 
 @styled

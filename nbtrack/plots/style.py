@@ -67,11 +67,12 @@ class NotebookFigure(Figure):
         from IPython import get_ipython  # only IPython calls this method; it may not be installed
 
         if shell := get_ipython():
-            # Sliders load pyplot's inline backend, which would draw figures cropped and small.
+            # Sliders load pyplot's inline backend, which registers a cropped, small PNG for every
+            # Figure. One that is registered for this class takes precedence.
             pictures = shell.display_formatter.formatters["image/png"]
             pictures.for_type(NotebookFigure, NotebookFigure._repr_png_)
         width, height = (round(pixels) for pixels in self.bbox.size)
-        alt = self.get_suptitle().replace("\n", " ")
+        alt = self.get_suptitle().replace("\n", " ").replace(r"\$", "$")
         return {}, {"image/png": {"alt": alt, "width": width, "height": height}}
 
     def _repr_png_(self) -> bytes:
