@@ -31,8 +31,7 @@ class Intrinsics:
             is_size = name in ("width", "height")
             low = 1 if is_size else 1e-3 if name in ("fx", "fy") else -1e7
             kind = numbers.Integral if is_size else numbers.Real
-            value = number(f"a camera's {name}", given, low, 1e7, kind)
-            object.__setattr__(self, name, value)
+            object.__setattr__(self, name, number(f"a camera's {name}", given, low, 1e7, kind))
 
     @classmethod
     def from_focal(cls, width: int, height: int, focal: float) -> "Intrinsics":

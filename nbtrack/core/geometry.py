@@ -13,7 +13,6 @@ _CROSS = (
     (0, 0, 1, 0, 0, 0, -1, 0, 0),
     (0, -1, 0, 1, 0, 0, 0, 0, 0),
 )
-_IDENTITY = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -35,7 +34,7 @@ def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
     """
     device, dtype = q_wxyz.device, q_wxyz.dtype
     w, v = normalize_quaternion(q_wxyz).split([1, 3], dim=-1)
-    identity = constant(_IDENTITY, device, dtype)
+    identity = constant(((1, 0, 0), (0, 1, 0), (0, 0, 1)), device, dtype)
     cross = (v[..., None] * constant(_CROSS, device, dtype)).sum(-2).unflatten(-1, (3, 3))  # [v]×
     w_identity_plus_cross = torch.addcmul(cross, w[..., None], identity)
     return torch.add(identity, cross @ w_identity_plus_cross, alpha=2)

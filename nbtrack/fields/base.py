@@ -182,8 +182,7 @@ class LearnedField(Field):
         coarse, colors, values, fine = self._two_passes(rays, n_stratified, n_importance, generator)
         fine_colors, fine_values = self.query_along(rays, fine)
         depths, order = torch.cat([coarse, fine], dim=1).sort(dim=1)
-        all_colors = torch.cat([colors, fine_colors], dim=1)
-        all_colors = all_colors.gather(1, order[..., None].expand_as(all_colors))
+        all_colors = torch.cat([colors, fine_colors], dim=1).take_along_dim(order[..., None], dim=1)
         all_values = torch.cat([values, fine_values], dim=1).gather(1, order)
         return self.composite(all_colors, all_values, rays, depths)
 
@@ -202,9 +201,8 @@ class LearnedField(Field):
     def render_rays(self, origins_world: Points, directions_world: Points) -> tuple[Colors, Values]:
         """Colour and z-depth (m) of rays, from two passes with samples at fixed places."""
         parts = []
-        some_origins = origins_world.split(_RAYS_AT_ONCE)
-        some_directions = directions_world.split(_RAYS_AT_ONCE)
-        for origins, directions in zip(some_origins, some_directions, strict=True):
+        batches = [each.split(_RAYS_AT_ONCE) for each in (origins_world, directions_world)]
+        for origins, directions in zip(*batches, strict=True):
             unused = torch.zeros_like(origins)  # in place of measured colours and depths
             rays = Rays(origins, directions, unused, unused[:, 0])
             parts.append(self.render_hierarchically(rays, _N_STRATIFIED, _N_IMPORTANCE))

@@ -83,10 +83,9 @@ class FourierMlp(nn.Module):
 def _linear(n_in: int, n_out: int, generator: Generator) -> nn.Linear:
     """A layer with zero bias and random weights: Kaiming-uniform, as for a rectifier."""
     layer = empty_linear(n_in, n_out)
-    bound = math.sqrt(6.0 / n_in)
     with torch.no_grad():
         drawn = torch.rand(n_out, n_in, generator=generator, dtype=torch.float32)
-        layer.weight.copy_((2 * drawn - 1) * bound)
+        layer.weight.copy_((2 * drawn - 1) * math.sqrt(6.0 / n_in))
         layer.bias.zero_()
     return layer
 

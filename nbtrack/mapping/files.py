@@ -46,8 +46,8 @@ class Map:
     @property
     def key(self) -> str:
         """A hash of the field, its bounds and its weights, as twelve hexadecimal digits."""
-        field, network = self.field, self.record["network"]
-        plain = [field.name, field.form, network, asdict(field.bounds)]
+        field = self.field
+        plain = [field.name, field.form, self.record["network"], asdict(field.bounds)]
         return digest_of(plain, _tensors(field))[:12]
 
 
@@ -125,8 +125,7 @@ def _map_of(content: bytes, file: Path) -> Map:
     name, record = header["field"], header["made"]
     _check_content(header, tensors)
     try:
-        low, high = header["bounds"]
-        bounds = SceneBounds(low, high, header.get("declared_unit"))
+        bounds = SceneBounds(*header["bounds"], header.get("declared_unit"))
         camera = Intrinsics(**header["camera"])
     except ConfigError as error:
         raise ValueError(error) from None  # `read_map` adds the file's name to a ValueError

@@ -200,7 +200,10 @@ class Tracker(abc.ABC):
     def __reduce__(self) -> tuple:
         """Copies and pickles are constructed anew and then take the `state`, like a resumed run."""
         arguments = self.field, self.estimates[-1], self.budget, self.settings
-        return _restored, (type(self), arguments, self.state())
+        return type(self), arguments, self.state()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.restore(state)
 
     def _warm_up(self, frame: Frame, T_starts: Poses) -> None:
         """Take some steps that do not count, since the first ones load, allocate and record.
@@ -237,10 +240,3 @@ class Tracker(abc.ABC):
         if not np.isfinite(pose).all():
             raise NumericalError(f"the pose of {frame.name} is not finite: lower learning rates")
         return Estimate(pose, not frame.has_depth, steps, seconds, float(loss), self.report())
-
-
-def _restored(kind: type[Tracker], arguments: tuple, state: dict[str, Any]) -> Tracker:
-    """A new tracker of a class, after it took a state."""
-    tracker = kind(*arguments)
-    tracker.restore(state)
-    return tracker
