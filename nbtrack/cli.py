@@ -169,7 +169,7 @@ def _writable(stream: TextIO | None) -> TextIO:
     closed, as a daemon's is; a stream that discards all text then takes its place.
     """
     if stream is None:
-        stream = os.fdopen(os.open(os.devnull, os.O_WRONLY), "w")
+        stream = open(os.devnull, "w")  # noqa: SIM115 (it stays open until Python ends)
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="backslashreplace")
     return stream

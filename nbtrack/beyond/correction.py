@@ -120,7 +120,7 @@ def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     field = corrected(finished.field, sequence, mapped, voxel)
     seconds = time.perf_counter() - start
     record = {**finished.record, "correction": voxel, "correction_seconds": seconds}
-    record["map_bytes"] = sum(tensor.nbytes for tensor in field.state_dict().values())
+    record["map_bytes"] = sum(tensor.nbytes for tensor in field.state().values())
     record["seconds"] += seconds
     record["misfit_m"] = usual_depth_residual(field, sequence, mapped)
     return replace(finished, field=field, record=record)
@@ -151,7 +151,7 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     reliabilities = np.tile(reliability, len(_OFFSETS))
     # Residuals above 1 cm are down-weighted.
     distance, diagonal = solve(matrix, wanted, reliabilities, regularisation, 0.01, rounds=4)
-    # Added to `_UNMEASURED`, by the share of measurements, not regularisation, in the diagonal.
+    # The share of the Hessian's diagonal that comes from measurements, not from regularisation.
     confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)
 
     at_surface = matrix[:n_points]  # the rows of the first offset, which is 0

@@ -196,7 +196,8 @@ def _read(
             for values, color in zip(part.depths_mm, part.colors, strict=True):
                 step = np.gcd.reduce(values, axis=None)
                 of_frame = np.bincount(values.ravel(), minlength=65536)
-                counts += of_frame, of_frame > findings.SHARED * values.size
+                counts[0] += of_frame
+                counts[1] += of_frame > findings.SHARED * values.size
                 rows.append(((values > 0).mean(), color.mean() / 255, step, zlib.crc32(values)))
             parts.append(part.select(np.isin(part_ids, ids_kept)))
             if len(ids) > _FRAMES_AT_ONCE:  # a single part is left for whoever reads next

@@ -150,8 +150,8 @@ def of_units(depth: pd.Series) -> Iterator[str]:
 def of_depths(frames: pd.DataFrame, depth: pd.Series, depth_scale: float) -> Iterator[str]:
     """Remarks about depths (m) that are read rightly: outliers, and coarse steps.
 
-    Depths and their steps are both in the declared unit. Only their ratios decide, which no unit
-    changes.
+    If the declared unit is wrong, depths and steps are wrong by the same factor; the test compares
+    them only with each other.
     """
     is_far = depth > far_limit(depth)
     if is_far.any():
@@ -163,5 +163,5 @@ def of_depths(frames: pd.DataFrame, depth: pd.Series, depth_scale: float) -> Ite
     step_m = np.gcd.reduce(frames.depth_step) / depth_scale
     # The steps may be chance if the farthest point is fewer than eight of them away.
     if _MAX_STEP * depth.median() < step_m < depth.max() / 8:
-        advice = "look for those that the camera gave, or expect no better poses"
+        advice = "use the camera's own depth files, or expect no better poses"
         yield f"depths come in steps of {100 * step_m:.1f} cm: {advice}"

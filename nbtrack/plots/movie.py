@@ -140,10 +140,11 @@ def rerun_bytes(surface: Mesh, seen: RgbdSequence, run: Trajectory, title: str) 
     matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
     lens = rr.Pinhole(image_from_camera=matrix, resolution=[camera.width, camera.height])
     recording.log("world/camera", lens, static=True)
+    index_of = {frame_id: index for index, frame_id in enumerate(seen.frame_ids.tolist())}
     for row in run.frames.itertuples():
         recording.set_time("frame", sequence=row.frame_id)
         recording.set_time("seconds", duration=row.time)
-        for i in np.flatnonzero(seen.frame_ids == row.frame_id):  # one frame, or none
+        if (i := index_of.get(row.frame_id)) is not None:
             T = seen.T_world_camera[i]
             recording.log("world/camera", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
             recording.log("world/camera/color", rr.Image(seen.colors[i]).compress())

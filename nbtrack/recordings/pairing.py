@@ -236,7 +236,8 @@ def _interpolated(
     is_between = (before + after <= _GAP) & (to_nearest > 1e-6)
     if not is_between.any():
         return found, ""
-    T_knots, wanted = flip(poses), times[is_between]  # camera-to-world poses at the stamps; s
+    T_knots = flip(poses)  # camera-to-world poses at the stamps
+    wanted = times[is_between]  # s
     T_wanted = np.tile(np.eye(4), (len(wanted), 1, 1))
     T_wanted[:, :3, 3] = interp1d(stamps, T_knots[:, :3, 3], axis=0)(wanted)
     turning = Slerp(stamps, Rotation.from_matrix(T_knots[:, :3, :3]))

@@ -143,8 +143,8 @@ def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times]:
 
     A line holds `timestamp tx ty tz` and a quaternion in the order `quaternion`, a 4x4 or 3x4
     matrix, or a row of a matrix. Poses are returned as they stand in the file, in its direction and
-    axes. They are NaN where a number is, and timestamps are NaN if the file has matrices. Raises
-    DataError for other lines, and for poses that are no rigid transforms.
+    axes. A pose is NaN if one of its numbers is; timestamps are NaN if the file has matrices.
+    Raises DataError for other lines, and for poses that are no rigid transforms.
     """
     numbers = read_numbers(path, (4, 8, 12, 16), _POSE_LINE)
     if numbers.shape[1] == 8:
