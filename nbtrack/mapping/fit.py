@@ -157,7 +157,8 @@ class _Fit:
         if not isinstance(terms, dict):
             raise ConfigError(f"{found} no dict: give terms by name")
         if self.terms and [*terms] != self.terms:
-            raise ConfigError(f"{found} {[*terms]} after {self.terms}: give the same every time")
+            advice = "give the same terms every time, 0 where one is not used"
+            raise ConfigError(f"{found} {', '.join(terms)} after {', '.join(self.terms)}: {advice}")
         self.terms = [*terms]
         losses = torch.stack([*terms.values()])
         self.optimizer.zero_grad()
