@@ -125,8 +125,7 @@ def plot_map_and_slice(
     The first panel has the surface as in `plot_mesh`, from a grid with cells of `voxel` metres. The
     second has a horizontal slice at the cameras' mean height in the same projection; what no frame
     of `sequence` has seen is grey. Both show the paths, which are camera-to-world poses (m) by
-    label. The last panel has the distances (mm) of the other paths from the first, pose by pose.
-    Poses may be NaN where they are unknown.
+    label; NaN if unknown. The last panel has the distances (mm) of other paths from the first.
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
