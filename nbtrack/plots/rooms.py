@@ -42,12 +42,11 @@ def plot_slice(
         drawn.insert(0, ExactDistance(room, drawn[0]))
     panels = new_axes(title, 5.4 - 0.8 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
     norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # those of the last, for all
-    T_world_camera = sequence.T_world_camera
-    of_cameras = np.nanmean(T_world_camera[:, :3, 3] @ scene.up_of(T_world_camera))
-    height = of_cameras if height is None else height
-    above = f", {of_cameras - height:.1f} m higher up" if abs(of_cameras - height) > 0.05 else ""
+    mean_m = np.nanmean(sequence.T_world_camera[:, :3, 3] @ scene.up_of(sequence.T_world_camera))
+    height = mean_m if height is None else height
+    above = f", {mean_m - height:.1f} m higher up" if abs(mean_m - height) > 0.05 else ""
     for axes, field in zip(panels[::-1], drawn[::-1], strict=True):
-        up, page = scene.draw_from_above(axes, {f"cameras{above}": T_world_camera})
+        up, page = scene.draw_from_above(axes, {f"cameras{above}": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / 240  # m
         points, places = _level_grid(page, low, high + step, step, height * up)
@@ -61,7 +60,7 @@ def plot_slice(
             is_seen = is_seen & _draw_true_level(axes, room, points, places)
         axes.plot([], [], "s", color=scene.UNSEEN, label="hardly or never seen")
         axes.set_title(f"{field.label}, {height:.2f} m up")
-        _end_around(axes, places[is_seen], T_world_camera[:, :3, 3] @ page.T)
+        _end_around(axes, places[is_seen], sequence.T_world_camera[:, :3, 3] @ page.T)
     return panels[0].figure.legend_below()
 
 
