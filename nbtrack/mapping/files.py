@@ -125,7 +125,8 @@ def _map_of(content: bytes, file: Path) -> Map:
     name, record = header["field"], header["made"]
     _check_content(header, tensors)
     try:
-        bounds = SceneBounds(*header["bounds"], header.get("declared_unit"))
+        low, high = header["bounds"]
+        bounds = SceneBounds(low, high, header.get("declared_unit"))
         camera = Intrinsics(**header["camera"])
     except ConfigError as error:
         raise ValueError(error) from None  # `read_map` adds the file's name to a ValueError
