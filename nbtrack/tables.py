@@ -103,8 +103,7 @@ def beside_published(results: pd.DataFrame) -> pd.DataFrame:
     printed with three digits, is above 0.2 m, or if it has no result.
     """
     ours, paper = table_1(results), table_1(published_table_1())
-    common = [scene for scene in ours if scene in paper]
-    if common:
+    if common := [scene for scene in ours if scene in paper]:
         return beside(ours[common], paper)
     sides = {"ours": ours, "paper": paper}
     summary = {("median ATE (m)", side): table.median(axis=1) for side, table in sides.items()}
@@ -135,8 +134,7 @@ def _check_keys(cells: pd.DataFrame, keys: list[str]) -> None:
     """Raises DataError if a key column is missing, or two rows have the same keys."""
     if not {*keys} <= {*cells}:
         raise DataError(f"a table has the columns {[*cells]}: it needs {', '.join(keys)}")
-    twice = cells[cells.duplicated(keys)]
-    if len(twice):
+    if len(twice := cells[cells.duplicated(keys)]):
         cell = ", ".join(str(key) for key in twice[keys].iloc[0])
         raise DataError(f"two rows for ({cell}); allowed: one per cell; remove one of them")
 

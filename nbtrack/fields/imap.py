@@ -44,6 +44,6 @@ class IMapField(LearnedField):
         rays = draw(settings.n_rays)
         # Samples are not guided by the measured depth, since those of tracking cannot be: at a
         # wrong pose the map's surface lies elsewhere (docs/choices.md).
-        n_first = settings.n_stratified
-        rendered = self.render_hierarchically(rays, n_first, settings.n_surface, generator)
+        n_first, n_second = settings.n_stratified, settings.n_surface
+        rendered = self.render_hierarchically(rays, n_first, n_second, generator)
         return rendered_losses(rendered, rays, settings.lambda_color, lambda_depth=1, over_std=True)

@@ -109,8 +109,7 @@ def importance_depths(
     borders = (depths[:, 1:] + depths[:, :-1]) / 2
     borders = torch.cat([depths[:, :1], borders, depths[:, -1:]], dim=1)
     share = weights + 1e-4
-    cdf = (share / share.sum(dim=1, keepdim=True)).cumsum(dim=1)
-    cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=1)
+    cdf = torch.nn.functional.pad((share / share.sum(dim=1, keepdim=True)).cumsum(dim=1), (1, 0))
     # Values of the cumulative distribution, stratified in [0, 1]: they form fewer clusters than
     # independent draws.
     levels = stratified_samples(0.0, depths.new_ones(len(depths)), n_samples, generator)

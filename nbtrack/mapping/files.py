@@ -122,7 +122,7 @@ def _map_of(content: bytes, file: Path) -> Map:
     # Nothing else notices a bit that flipped on a disk, or a number edited by hand.
     if header.pop("digest", None) != digest_of(header, tensors):
         raise ValueError("its content is not what was written")
-    name, record = header["field"], header["made"]
+    name, form, record = header["field"], header["form"], header["made"]
     _check_content(header, tensors)
     try:
         low, high = header["bounds"]
@@ -133,7 +133,6 @@ def _map_of(content: bytes, file: Path) -> Map:
     if name not in FIELDS:
         found = f"{file} is a map of field {name!r}, which is not registered"
         raise ConfigError(f"{found}: import the file of its class first (--import FILE.py)")
-    form = header["form"]
     kind = look_up("form of maps", form, FORMS) if form else FIELDS[name]
     return Map(kind.from_state(tensors, record, bounds), camera, record)
 

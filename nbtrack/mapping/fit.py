@@ -85,12 +85,11 @@ def recipe_of(
     field_name: str, sequence: RgbdSequence, network: Any, settings: Any, seed: int
 ) -> dict[str, Any]:
     """All that determines a map, as plain values: maps with the same recipe are the same."""
-    ids = sequence.frame_ids
     return {
         "field": field_name,
         "scene": sequence.name,
         "n_frames": len(sequence),
-        "first_and_last_frame": [int(ids[0]), int(ids[-1])],
+        "first_and_last_frame": sequence.frame_ids[[0, -1]].tolist(),
         "data": sequence.digest,
         "origin": sequence.origin.tolist(),
         "seed": whole_number("seed", seed),

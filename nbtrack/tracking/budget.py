@@ -68,8 +68,7 @@ class ClockBudget:
             finally:  # also when the caller closes the frame, since its search has converged
                 step += 1
                 now = self._now(device)
-                mean = (now - prepared) / step
-                self.memory = mean
+                self.memory = mean = (now - prepared) / step
 
 
 class StepBudget:

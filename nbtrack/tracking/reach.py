@@ -45,8 +45,7 @@ def motion_of(
     Offsets are in m along the world's axes; turns are rotation vectors (rad) in the start's camera
     frame. The motion model gives the start from the true poses of the frames before.
     """
-    offsets = np.zeros((len(T_world_camera) - 1, 3))
-    turns = np.zeros_like(offsets)
+    offsets, turns = np.zeros((2, len(T_world_camera) - 1, 3))
     for k, T_true in enumerate(T_world_camera[1:], start=1):
         T_start = _nearest_start(motion_model, [*T_world_camera[max(0, k - 2) : k]], T_true)
         offsets[k - 1] = T_true[:3, 3] - T_start[:3, 3]
