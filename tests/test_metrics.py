@@ -115,7 +115,7 @@ def test_poses_that_cannot_be_compared() -> None:
     poses, spoilt = wandering(6), wandering(6)
     spoilt[4, 0, 3] = np.nan
     for pair in ((spoilt, poses), (poses, spoilt), (poses[:1], poses), (poses[:0], poses[:0])):
-        says = f"{len(pair[0])} estimated and {len(pair[1])} true poses: give equally many"
+        says = f"{len(pair[0])} estimates, {len(pair[1])} true poses: "
         with pytest.raises(DataError, match=says):
             pose_errors(*pair)
 

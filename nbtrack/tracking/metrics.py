@@ -67,7 +67,7 @@ def pose_errors(T_estimated: Poses, T_true: Poses) -> tuple[Errors, Errors]:
     n_frames = len(T_true)
     is_paired = n_frames > 0 and len(T_estimated) == n_frames
     if not (is_paired and np.isfinite(T_estimated + T_true).all()):
-        raise DataError(f"{len(T_estimated)} for {n_frames} true poses: give pairs, all finite")
+        raise DataError(f"{len(T_estimated)} estimates, {n_frames} true poses: pair finite ones")
     turn = T_true[:, :3, :3].mT @ T_estimated[:, :3, :3]
     distances = np.linalg.norm(T_estimated[:, :3, 3] - T_true[:, :3, 3], axis=1)
     return distances, np.degrees(Rotation.from_matrix(turn).magnitude())
