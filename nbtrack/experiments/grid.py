@@ -81,8 +81,8 @@ def track_scenes(
         n_steps = steps if rate_hz is None else None if clock else method.paper_steps(rate_hz)
         clock_hz = rate_hz if clock else None
         make_budget(n_steps, clock_hz)  # raises for a wrong number, before anything is made
-        map_job = MapJob.of(scene, method.field, with_method, seed=seed)
-        job = TrackJob(map_job, seen, tracker, settings, n_steps, clock_hz, frames, seed)
+        map_job = MapJob.of(scene, method.field, with_method, seed=seed)  # makes it an int
+        job = TrackJob(map_job, seen, tracker, settings, n_steps, clock_hz, frames, map_job.seed)
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
         rows.append(row | {"seed": seed, "run": job.folder.name, "n_pixels": settings.n_pixels})
