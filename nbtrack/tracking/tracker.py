@@ -177,7 +177,7 @@ class Tracker(abc.ABC):
         Only a class that overrides `restart_anywhere` can find it, and only in a corrected map.
         """
         if cls.restart_anywhere is Tracker.restart_anywhere or not in_corrected:
-            raise ConfigError(f"{cls.name!r} cannot find a camera: take lm and --method corrected")
+            raise ConfigError(f"{cls.name!r} finds no unknown first pose: take --method corrected")
 
     def state(self) -> dict[str, Any]:
         """What the tracker remembers from past frames: tensors and plain values."""
