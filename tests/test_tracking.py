@@ -157,7 +157,7 @@ def test_wrong_arguments() -> None:
     with pytest.raises(ConfigError, match="'vr' does not work on field 'baked'"):
         make_tracker("vr", BakedField(BoxRoom(), 0.2), np.eye(4), StepBudget(1))
     for name, in_corrected in (("sdf", True), ("lm", False)):
-        with pytest.raises(ConfigError, match="cannot find a camera"):
+        with pytest.raises(ConfigError, match="finds no unknown first pose"):
             tracker_class(name).check_finds(in_corrected)
     sequence, tracker = walk(3), tracker_of("sdf", 2)
     with pytest.raises(DataError, match="too short to track"):
