@@ -52,7 +52,8 @@ class Square(Job):
             raise DataError("it runs beside others")
         if self.how == "deadly":
             os._exit(1)
-        end = time.monotonic() + (1.5 if self.how == "slowly" else 0.0)
+        # Long enough for a report, which is written after a second, to be seen a second later.
+        end = time.monotonic() + (3.0 if self.how == "slowly" else 0.0)
         while time.monotonic() < end:
             report(0.5, "half")
             time.sleep(0.1)
