@@ -28,7 +28,14 @@ from nbtrack.machinery.files import absolute
 from nbtrack.machinery.settings import read_setting
 from nbtrack.mapping.files import MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.tracking import StepBudget, make_budget, make_tracker, paper_steps, track_sequence
+from nbtrack.tracking import (
+    ClockBudget,
+    StepBudget,
+    make_budget,
+    make_tracker,
+    paper_steps,
+    track_sequence,
+)
 from nbtrack.tracking.methods import METHODS, find_methods
 from nbtrack.tracking.paper import SdfSettings, SdfTracker
 
@@ -133,6 +140,14 @@ REFUSED = {
     "a number for a method": lambda: find_methods([3]),
     "a list for a method": lambda: find_methods([["sdf"]]),
     "a text for settings": lambda: find_methods([replace(SDF, settings="tracking.sdf.seed=1")]),
+    "a number for a setting": lambda: nbtrack.load_preset(settings=[1]),
+    "a number for a clock": lambda: ClockBudget(10, clock=5),
+    "no table of losses": lambda: write_map("here", replace(mapped(), history=None)),
+    "a size for a camera": lambda: replace(SEQUENCE, intrinsics=(32, 24)),
+    "a picture without a camera": lambda: DENSITY.render_view(None, np.eye(4)),
+    "a pose in the complex plane": lambda: tracker(pose=np.eye(4) * 1j),
+    "workers for an execution": tracked_with(execution=2),
+    "an array of one number": tracked_with(rates_hz=np.array(10)),
     "fewer tracked": lambda: nbtrack.track_scenes(**scenes(), tracked=2 * scenes()["scenes"]),
 }
 
@@ -151,6 +166,12 @@ def test_right_in_another_form() -> None:
     point = torch.tensor([[0.1, 0.2, 0.3]])
     for field in (DENSITY, BakedField(BoxRoom(), 0.2)):
         assert torch.equal(field(point.double())[1], field(point)[1])
+    poses = [
+        track_sequence(tracker(field), SEQUENCE).T_estimated
+        for field in (mapped().field, mapped().field.half(), mapped().field.double())
+    ]
+    assert np.array_equal(poses[0], poses[2])
+    assert np.allclose(poses[0], poses[1], rtol=0, atol=1e-3)
     backwards = SEQUENCE.select(slice(None, None, -1))
     foreign = replace(backwards, depths_mm=backwards.depths_mm.astype(">u2"))
     assert mapped(foreign).key == mapped(backwards.select(np.arange(4))).key
@@ -265,7 +286,7 @@ def test_a_checkpoint_knows_whose_it_is(case: str, tmp_path: Path, monkeypatch) 
     """Catches the path of another run, returned as this one's."""
     monkeypatch.setattr("nbtrack.machinery.files.CHECKPOINT_SECONDS", -1)
     path = tmp_path / "run.pt"
-    known = track_sequence(tracker(mapped(seed=1).field), SEQUENCE, path)
+    known = track_sequence(tracker(mapped(seed=1).field), SEQUENCE, str(path))
     again = track_sequence(tracker(mapped(seed=1).field), SEQUENCE, path)
     assert np.array_equal(known.T_estimated, again.T_estimated)
     other = {"field": mapped(seed=1).field, "sequence": SEQUENCE, **OTHERS[case]}

@@ -230,7 +230,7 @@ def test_a_place_too_large_for_a_correction() -> None:
 
 
 NO_TERMS = [
-    (lambda terms: sum(terms.values()), "mapping_losses of mine gave no dict"),
+    (lambda terms: sum(terms.values()), "mapping_losses of mine"),
     (lambda terms: {"color": terms["color"]}, "gave color after depth, color, eikonal: give"),
 ]
 

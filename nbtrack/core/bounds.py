@@ -8,9 +8,10 @@ from jaxtyping import Float
 
 from nbtrack.core.arrays import Points, Values
 from nbtrack.machinery.device import constant
-from nbtrack.machinery.errors import ConfigError, check_lists
+from nbtrack.machinery.errors import ConfigError, typed
 
 
+@typed
 @dataclass(frozen=True)
 class SceneBounds:
     """Axis-aligned box in the world frame, metres."""
@@ -21,11 +22,9 @@ class SceneBounds:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for corners that are not finite or span no box, or a unit <= 0."""
-        check_lists(at_least=3, minimum=self.minimum, maximum=self.maximum)
         low, high = (tuple(float(x) for x in corner) for corner in (self.minimum, self.maximum))
         unit = 1.0 if self.declared_unit is None else float(self.declared_unit)
-        has_3_axes = len(low) == len(high) == 3
-        if not has_3_axes or not all(0 < x < np.inf for x in (*np.subtract(high, low), unit)):
+        if not all(0 < x < np.inf for x in (*np.subtract(high, low), unit)):
             raise ConfigError(f"{self} are no bounds: give a minimum and a larger maximum, in m")
         object.__setattr__(self, "minimum", low)
         object.__setattr__(self, "maximum", high)

@@ -9,12 +9,13 @@ from torch import Tensor
 
 from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
 from nbtrack.core.camera import Intrinsics, backproject
-from nbtrack.machinery.errors import check_kind
+from nbtrack.machinery.errors import typed
 from nbtrack.machinery.inputs import check_array, checked_images
 
 MILLIMETRE = 1e-3
 
 
+@typed
 @dataclass(frozen=True, eq=False)
 class Frame:
     """Colour and depth of one moment, as integers; `at` gives chosen pixels in floating point."""
@@ -37,6 +38,7 @@ class Frame:
         object.__setattr__(self, "depth_mm", self.depth_mm.contiguous())
 
     @classmethod
+    @typed
     def of_images(cls, camera: Intrinsics, color: np.ndarray, depth: np.ndarray) -> "Frame":
         """A frame of a camera's images. They are copied, so that the caller may reuse their memory.
 
@@ -49,7 +51,6 @@ class Frame:
                 measured if it is 0, NaN, infinite, negative, masked, or at least 65535 mm (the
                 largest number of 16 bits).
         """
-        check_kind(Intrinsics, camera=camera)
         rgb, depth_mm = checked_images(color, depth, (camera.height, camera.width))
         return cls(camera, torch.from_numpy(rgb), torch.from_numpy(depth_mm))
 

@@ -12,7 +12,7 @@ from nbtrack.core.arrays import Poses, Position
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import MILLIMETRE, Frame
-from nbtrack.machinery.errors import ConfigError, DataError, check_kind
+from nbtrack.machinery.errors import ConfigError, DataError, typed
 from nbtrack.machinery.inputs import check_array, checked_poses
 
 # `observed_bounds` uses about so many pixels of each frame, on a regular grid (our choice).
@@ -23,6 +23,7 @@ _CUT_OFF = 0.002
 ARRAYS = "colors", "depths_mm", "T_world_camera", "frame_ids", "times"
 
 
+@typed
 @dataclass(frozen=True)
 class RgbdSequence:
     """RGB-D frames with camera poses, kept as integers (5 bytes a pixel).
@@ -58,10 +59,9 @@ class RgbdSequence:
         size = f"{self.intrinsics.width}x{self.intrinsics.height}"
         return f"RgbdSequence({self.name!r}, {len(self)} frames of {size})"
 
+    @typed
     def __getitem__(self, index: int) -> Frame:
-        """A copy of one frame, with its true pose if that is known."""
-        if not isinstance(index, int | np.integer):
-            raise ConfigError(f"{self!r}[{index}]: give one frame's number; `select` takes several")
+        """A copy of one frame, with its true pose if that is known; `select` takes several."""
         color = torch.from_numpy(self.colors[index].copy())
         depth_mm = torch.from_numpy(self.depths_mm[index].astype(np.int32))
         name = f"frame {self.frame_ids[index]} of {self.name}"
@@ -93,13 +93,13 @@ class RgbdSequence:
         return replace(self, **{name: getattr(self, name)[indices] for name in ARRAYS})
 
 
+@typed
 def observed_bounds(sequence: RgbdSequence, margin: float = 0.1) -> SceneBounds:
     """The box around what a sequence sees and around its cameras, enlarged by `margin` (m).
 
     A few points at either end of each axis are left out, so that wrong depths do not stretch it.
     Raises DataError if a frame has no known pose, or if no pixel that is used has a depth.
     """
-    check_kind(RgbdSequence, sequence=sequence)
     poses = checked_poses(sequence.T_world_camera, Path(sequence.name))
     is_posed = np.isfinite(poses).all(axis=(1, 2))
     if not (len(sequence) and is_posed.all()):

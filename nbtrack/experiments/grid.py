@@ -14,7 +14,7 @@ from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
-from nbtrack.machinery.errors import ConfigError, NbtrackError, check_kind, check_lists
+from nbtrack.machinery.errors import ConfigError, NbtrackError, typed
 from nbtrack.machinery.files import absolute, runs_folder
 from nbtrack.machinery.progress import tell
 from nbtrack.mapping.files import Map
@@ -23,22 +23,21 @@ from nbtrack.tracking.methods import Methods, find_methods
 from nbtrack.tracking.trajectories import Trajectory
 
 
+@typed
 def map_scene(scene: Scene, field: str, preset: Preset, seed: int = 0) -> Map:
     """The map of a scene, from the cache, or made now if it is not there."""
-    _pairs([scene], [scene], preset)  # raises for arguments of other types
     job = MapJob.of(scene, field, preset, seed=seed)
     run_jobs([job])
     return job.map()
 
 
+@typed
 def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -> pd.DataFrame:
     """Map scenes in fields; maps that are not cached are made.
 
     Returns a row for each map: field, scene, seed, seconds, and the scores of `quality.SCORES`.
     Raises ConfigError if scenes or fields are no lists.
     """
-    _pairs(scenes, scenes, preset)  # raises for arguments of other types
-    check_lists(at_least=1, fields=fields)
     jobs = [MapJob.of(scene, field, preset) for field, scene in product(fields, scenes)]
     rows = []
     for job, record in zip(jobs, run_jobs(jobs), strict=True):
@@ -47,6 +46,7 @@ def map_scenes(scenes: Sequence[Scene], fields: Sequence[str], preset: Preset) -
     return pd.DataFrame(rows)
 
 
+@typed
 def track_scenes(
     scenes: Sequence[Scene],
     methods: Methods,
@@ -71,7 +71,7 @@ def track_scenes(
     Returns a row for each run: rate_hz, steps, method, n_pixels, scene, seed, run (its name), the
     metrics, ate_m (NaN if unknown), failure. Raises ConfigError, and what `run_jobs` raises.
     """
-    pairs = _pairs(scenes, scenes if tracked is None else tracked, preset, seeds)
+    pairs = _pairs(scenes, scenes if tracked is None else tracked)
     rates, steps = _rates(preset.tables.rates_hz, rates_hz, steps, clock)
     frames = preset.scenes.track_frames if frames is None else str(frames)
     jobs, rows = [], []
@@ -89,16 +89,8 @@ def track_scenes(
     return pd.DataFrame(map(_row_of, rows, _run(jobs, execution)))
 
 
-def _pairs(scenes: Sequence, tracked: Sequence, preset: Preset, seeds: Any = (0,)) -> list[tuple]:
-    """Pairs of a mapped scene and the scene that is tracked in its map.
-
-    Raises ConfigError for a preset, scenes or seeds of another type, for an empty list, and if the
-    two lists of scenes differ in length.
-    """
-    check_kind(Preset, preset=preset)
-    check_lists(at_least=1, scenes=scenes, tracked=tracked, seeds=seeds)
-    for scene in (*scenes, *tracked):
-        check_kind(Scene, scene=scene)
+def _pairs(scenes: Sequence[Scene], tracked: Sequence[Scene]) -> list[tuple[Scene, Scene]]:
+    """Pairs of a mapped scene and the one that is tracked in its map. ConfigError if one lacks."""
     if len(tracked) != len(scenes):
         raise ConfigError(f"{len(tracked)} tracked for {len(scenes)} scenes: give one for each")
     return [*zip(scenes, tracked, strict=True)]
@@ -111,7 +103,6 @@ def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: boo
     with rates or with the clock.
     """
     rates = usual_hz if rates_hz is None else rates_hz
-    check_lists(at_least=1, rates_hz=rates)
     if steps is not None and (rates_hz is not None or clock):
         raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: leave one out")
     # `tolist` turns numbers of numpy into Python's, and leaves None as it is.

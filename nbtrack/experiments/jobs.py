@@ -24,7 +24,7 @@ from nbtrack.experiments.runs import check_no_recording
 from nbtrack.experiments.workers import DEATHS, Workplace, cluster, processes
 from nbtrack.fields import FIELDS
 from nbtrack.machinery import device
-from nbtrack.machinery.errors import MissingError, NbtrackError
+from nbtrack.machinery.errors import ConfigError, MissingError, NbtrackError
 from nbtrack.machinery.files import data_folder, locked, runs_folder, write_atomic
 from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.images import images_of
@@ -149,8 +149,11 @@ def _waves(jobs: Sequence[Job]) -> list[dict[Path, Job]]:
     """The jobs that are not done, and those that they need, in groups that run one after the other.
 
     A group maps folders to jobs, which need only jobs of earlier groups. For tracked runs in
-    corrected maps the groups are plain maps, corrected maps, and runs.
+    corrected maps the groups are plain maps, corrected maps, and runs. Raises ConfigError if no job
+    is given.
     """
+    if not jobs:
+        raise ConfigError("nothing to do: give at least one scene, field or method, rate and seed")
     waves = []
     wave = {job.folder: job for job in jobs if not job.is_done}
     while wave:

@@ -16,7 +16,7 @@ from typing import Any
 
 from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.fields import FIELDS, LearnedField, NetworkSettings, field_class
-from nbtrack.machinery.errors import ConfigError, MissingError, check_lists, look_up
+from nbtrack.machinery.errors import ConfigError, MissingError, look_up, typed
 from nbtrack.machinery.files import absolute
 from nbtrack.machinery.inputs import read_object
 from nbtrack.machinery.settings import flat, limited, one_of, with_settings, with_values
@@ -214,6 +214,7 @@ def _changes_of_unnamed(changes: dict[str, Any], tree: dict[str, Any]) -> dict[s
     return values
 
 
+@typed
 def load_preset(
     name: str | None = None,
     config_file: Path | None = None,
@@ -228,7 +229,6 @@ def load_preset(
     for an unknown preset or key, or a value of the wrong type or range; MissingError if the file
     does not exist; DataError if it is no TOML.
     """
-    check_lists(settings=settings, of_method=of_method)
     preset = look_up("preset", name or os.environ.get("NBTRACK_PRESET") or "smoke", PRESETS)
     config_file = config_file or os.environ.get("NBTRACK_CONFIG")
     if config_file:
@@ -244,6 +244,7 @@ def load_preset(
     return with_settings(preset, *before, *settings).with_method(of_method)
 
 
+@typed
 def claim(preset: Preset, holds: bool, text: str, usual: Sequence[str] = ()) -> None:
     """Print a claim of a notebook about its results if it `holds`; else warn that it does not.
 

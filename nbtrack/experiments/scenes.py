@@ -10,7 +10,7 @@ from nbtrack.data.dataset import DATASET_SCENES
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.presets import Preset, ScenesConfig
 from nbtrack.experiments.runs import check_no_recording, is_own_output
-from nbtrack.machinery.errors import ConfigError, DataError, MissingError, check_kind, nearest_name
+from nbtrack.machinery.errors import ConfigError, DataError, MissingError, nearest_name, typed
 from nbtrack.machinery.files import absolute, data_folder, fingerprint, locked, runs_folder
 from nbtrack.machinery.progress import ProgressBar, tell
 from nbtrack.recordings import reading
@@ -68,6 +68,7 @@ class Scene:
         return reading.select_frames(self.recording, reading.parse_frames(frames), needs_poses)
 
 
+@typed
 def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) -> Scene:
     """The scene that a user means by `sequence`.
 
@@ -78,7 +79,6 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     Raises ConfigError if there is no such folder, room or scene, and MissingError if the scene of
     the dataset was not downloaded.
     """
-    check_kind(Preset, preset=preset)
     text = str(sequence)
     folder = absolute(sequence)
     # The name of a room or scene also wins over a plain file.
@@ -100,6 +100,7 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     raise ConfigError(f"{found}; {nearest_name(text, _KNOWN)}")
 
 
+@typed
 def open_scenes(preset: Preset) -> list[Scene]:
     """Open the scenes that the preset names; synthetic rooms that are not there are made.
 
@@ -108,7 +109,6 @@ def open_scenes(preset: Preset) -> list[Scene]:
     names no scene, names an unknown one, or names two by paths with the same last part, which is
     the scene's name in tables.
     """
-    check_kind(Preset, preset=preset)
     names = preset.scenes.names
     last_parts = {Path(name).name for name in names}
     if not names or len(last_parts) < len(names):

@@ -20,6 +20,7 @@ from nbtrack.fields import rendering
 from nbtrack.fields.mlp import NetworkSettings
 from nbtrack.fields.rendering import Rendering, Weights
 from nbtrack.machinery.device import usual_modes
+from nbtrack.machinery.errors import typed
 from nbtrack.machinery.inputs import check_array, checked_pose
 from nbtrack.machinery.settings import MANY, limited
 
@@ -186,6 +187,7 @@ class LearnedField(Field):
         all_values = torch.cat([values, fine_values], dim=1).gather(1, order)
         return self.composite(all_colors, all_values, rays, depths)
 
+    @typed
     @usual_modes()
     def render_view(self, camera: Intrinsics, T_world_camera: Pose) -> View:
         """The colour (in [0, 1]) and z-depth (m) images from a camera pose, without randomness."""

@@ -1,10 +1,16 @@
 """One exception family. A message says what was found, what is allowed and what to do next."""
 
 import difflib
-from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+import functools
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral, Real
+from types import NoneType, UnionType
+from typing import Any, TypeVar, get_args, get_origin
 
 Entry = TypeVar("Entry")
+_NUMBERS = {int: Integral, float: Real}  # numpy's numbers are of these kinds, too
 
 
 class NbtrackError(Exception):
@@ -42,29 +48,54 @@ def look_up(what: str, name: str, known: Mapping[str, Entry]) -> Entry:
     return known[name]
 
 
-def check_lists(at_least: int = 0, **arguments: object) -> None:
-    """Raises ConfigError for an argument that is no list of at least `at_least` entries.
+def typed(checked: Callable) -> Callable:
+    """Decorate a public function, method or dataclass: it then refuses arguments of another kind.
 
-    Tuples and arrays are lists here. Texts, dictionaries, single objects and iterators are not.
-    The keyword of each argument is its name in the message.
+    Its annotations say which kind each argument is: see `check_argument`.
     """
-    for name, value in arguments.items():
-        is_list = hasattr(value, "__getitem__") and hasattr(value, "__len__")
-        if isinstance(value, str | bytes | Mapping) or not is_list:
-            raise ConfigError(f"{name} = {value!r:.80} is no list: write {name}=[...] around it")
-        if len(value) < at_least:
-            raise ConfigError(f"{name} = {value!r:.80}: give at least {at_least}")
+    if isinstance(checked, type):
+        checked.__init__ = typed(checked.__init__)
+        return checked
+    signature = inspect.signature(checked)
+
+    @functools.wraps(checked)
+    def call(*arguments: Any, **named: Any) -> Any:
+        for name, value in signature.bind(*arguments, **named).arguments.items():
+            check_argument(name, value, signature.parameters[name].annotation)
+        return checked(*arguments, **named)
+
+    return call
 
 
-def check_kind(kind: Any, **arguments: object) -> None:
-    """Raises ConfigError for an argument that is not of the class `kind`.
+def check_argument(name: str, value: Any, kind: Any) -> None:
+    """Raises ConfigError, which calls the argument `name`, unless a value is of the annotated kind.
 
-    `kind` may be a union of classes. The keyword of each argument is its name in the message.
+    Checked are classes of this package, tables, texts, numbers, functions, and lists of these.
+    Tuples and arrays are lists, but texts, dictionaries, sets and iterators are not. Paths, arrays
+    and poses may have several forms, so they are checked where they are converted.
     """
-    for name, value in arguments.items():
-        if not isinstance(value, kind):
-            wanted = getattr(kind, "__name__", kind)
-            raise ConfigError(f"{name} is {value!r:.60}: give what is of class {wanted}")
+    if not _is_of(value, kind):
+        found = " ".join(f"{value!r:.80}".split())
+        wanted = re.sub(r"[\w.]+\.", "", inspect.formatannotation(kind))  # without modules
+        raise ConfigError(f"{name} is {found}: give {wanted}")
+
+
+def _is_of(value: Any, kind: Any) -> bool:
+    """Whether a value is of a kind, as far as `check_argument` checks it."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is UnionType:
+        return any(_is_of(value, part) for part in parts)
+    if origin is Callable:
+        return callable(value)
+    if origin in (Sequence, tuple):
+        entries = value.tolist() if hasattr(value, "tolist") else value
+        if not isinstance(entries, Sequence) or isinstance(entries, str | bytes):
+            return False
+        fits = origin is Sequence or ... in parts or len(entries) == len(parts)
+        return fits and all(_is_of(entry, parts[0]) for entry in entries)
+    is_checked = kind in _NUMBERS or kind in (str, dict, NoneType)
+    is_checked |= kind.__module__.partition(".")[0] in ("nbtrack", "pandas")
+    return not is_checked or isinstance(value, _NUMBERS.get(kind, kind))
 
 
 def look_up_kind(what: str, name: str, known: Mapping[str, type], needed: Sequence[str]) -> type:

@@ -134,12 +134,12 @@ class Checkpoint:
     With the path None nothing is written, and every run begins anew.
     """
 
-    def __init__(self, path: Path | None, recipe: dict[str, Any]) -> None:
+    def __init__(self, path: Path | str | None, recipe: dict[str, Any]) -> None:
         """`recipe` holds by name what the run depends on.
 
         It is stored in the file. `resume` compares it, and names in its error what differs.
         """
-        self.path = path
+        self.path = None if path is None else absolute(path)
         self.recipe = recipe
         self.last_saved = time.perf_counter()
 

@@ -124,7 +124,8 @@ def checked_pose(T_world_camera: Any) -> Float[np.ndarray, "4 4"]:
     if isinstance(T_world_camera, Tensor):  # perhaps on a GPU, or with gradients
         T_world_camera = T_world_camera.detach().cpu().numpy()
     try:
-        pose = np.array(T_world_camera, dtype=np.float64)
+        # Unlike `dtype`, this refuses complex numbers and texts.
+        pose = np.asarray(T_world_camera).astype(np.float64, casting="same_kind")
     except (TypeError, ValueError):
         pose = np.empty(0)  # of a shape that is refused
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or not pose[:3].any():

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from nbtrack.machinery.errors import ConfigError, check_kind, look_up
+from nbtrack.machinery.errors import ConfigError, check_argument, look_up
 
 Config = TypeVar("Config")
 MANY = 1_000_000
@@ -77,7 +77,7 @@ def checked(config: Config, kind: type) -> Config:
     Raises ConfigError if they are no object of the class `kind` or of a subclass, or if a value has
     another type than its default or lies beyond its limits. Numbers of numpy become Python's.
     """
-    check_kind(kind, settings=config)
+    check_argument("settings", config, kind)
     return with_values(type(config)(), flat(config))
 
 

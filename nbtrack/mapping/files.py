@@ -16,7 +16,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.fields import FIELDS, Field
 from nbtrack.machinery.device import usual_modes
-from nbtrack.machinery.errors import ConfigError, MissingError, check_kind, look_up
+from nbtrack.machinery.errors import ConfigError, MissingError, look_up, typed
 from nbtrack.machinery.files import absolute, digest_of, naming_damaged, write_together
 from nbtrack.machinery.registry import Registry
 
@@ -31,6 +31,7 @@ FORMS: Registry[type[Field]] = Registry({})
 _AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
 
 
+@typed
 @dataclass(frozen=True)
 class Map:
     """A mapped scene, ready for tracking, and the record of how it was made."""
@@ -51,6 +52,7 @@ class Map:
         return digest_of(plain, _tensors(field))[:12]
 
 
+@typed
 @usual_modes()
 def write_map(path: Path | str, finished: Map) -> None:
     """Writes a map to a file, of about 1 MB for the paper's network.
@@ -60,7 +62,6 @@ def write_map(path: Path | str, finished: Map) -> None:
     file gives the same trajectories as the map. If `read_map` could not read the file, nothing is
     written and ConfigError or DataError is raised.
     """
-    check_kind(Map, finished=finished)
     path = absolute(path)
     path = path / MAP_FILE if path.is_dir() else path
     field, bounds = finished.field, finished.field.bounds

@@ -16,7 +16,7 @@ from nbtrack.data.pixels import PixelSampler
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import LearnedField, MappingSettings, field_class, make_field
 from nbtrack.machinery.device import advise_on_memory, device_name, suited_to, threads, usual_modes
-from nbtrack.machinery.errors import ConfigError, NumericalError
+from nbtrack.machinery.errors import ConfigError, NumericalError, check_argument, typed
 from nbtrack.machinery.files import Checkpoint
 from nbtrack.machinery.inputs import whole_number
 from nbtrack.machinery.launches import Recording, make_adam
@@ -38,6 +38,7 @@ def learning_rate(settings: MappingSettings, iteration: int) -> float:
     return settings.learning_rate * share
 
 
+@typed
 @usual_modes()
 def map_sequence(
     field_name: str,
@@ -46,7 +47,7 @@ def map_sequence(
     settings: Any,
     seed: int = 0,
     device: torch.device | None = None,
-    checkpoint: Path | None = None,
+    checkpoint: Path | str | None = None,
     on_iteration: OnIteration = lambda done, losses: None,
     code: str = "",
 ) -> Map:
@@ -121,7 +122,7 @@ class _Fit:
         self.history = []
         self.terms: list[str] = []  # names of the loss terms, known from the first batch on
 
-    def run(self, checkpoint: Path | None, on_iteration: OnIteration) -> None:
+    def run(self, checkpoint: Path | str | None, on_iteration: OnIteration) -> None:
         """Fit from the checkpoint, if any, to the last iteration; then make the field constant."""
         file = Checkpoint(checkpoint, self.recipe)
         file.resume(self._take_up)
@@ -152,12 +153,12 @@ class _Fit:
         """Take one step of Adam on a batch; returns the losses before it, ordered as `terms`."""
         draw = partial(self.sampler.draw, generator=self.generator, frames=self.frames)
         terms = self.field.mapping_losses(draw, self.settings, self.generator)
-        found = f"mapping_losses of {self.field.name} gave"
-        if not isinstance(terms, dict):
-            raise ConfigError(f"{found} no dict: give terms by name")
+        found = f"mapping_losses of {self.field.name}"
+        check_argument(found, terms, dict)
         if self.terms and [*terms] != self.terms:
             advice = "give the same terms every time, 0 where one is not used"
-            raise ConfigError(f"{found} {', '.join(terms)} after {', '.join(self.terms)}: {advice}")
+            found += f" gave {', '.join(terms)} after {', '.join(self.terms)}"
+            raise ConfigError(f"{found}: {advice}")
         self.terms = [*terms]
         losses = torch.stack([*terms.values()])
         self.optimizer.zero_grad()

@@ -12,7 +12,7 @@ from math import floor
 import torch
 
 from nbtrack.machinery.device import synchronize
-from nbtrack.machinery.errors import ConfigError, look_up
+from nbtrack.machinery.errors import ConfigError, look_up, typed
 from nbtrack.machinery.inputs import number
 
 _HOST = torch.device("cpu")
@@ -35,6 +35,7 @@ class ClockBudget:
     the first step is our choice.
     """
 
+    @typed
     def __init__(self, rate_hz: Number, clock: Callable[[], float] = time.perf_counter) -> None:
         """Take a rate (Hz) and a clock (s). Raises ConfigError for a rate beyond 0.001 to 1e6."""
         self.rate_hz = number("rate_hz", rate_hz, _FEWEST, _MOST)

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from nbtrack.fields import field_class
-from nbtrack.machinery.errors import check_lists, look_up
+from nbtrack.machinery.errors import check_argument, look_up, typed
 from nbtrack.machinery.registry import Registry
 from nbtrack.tracking import paper_steps, tracker_class
 
 
+@typed
 @dataclass(frozen=True)
 class Method:
     """A field, a tracker and their settings: a row of Table I or III."""
@@ -57,18 +58,15 @@ METHODS: Registry[Method] = Registry(_OF_PAPER)
 `METHODS["mine"] = Method(...)` adds your own."""
 
 
+@typed
 def find_methods(methods: Methods) -> list[Method]:
     """The methods of a list of names and `Method` objects, in order, each once.
 
-    Raises ConfigError if `methods` is no list or is empty, if an entry is neither a known name nor
-    a `Method`, if a method's settings are no list, or if its tracker does not work in its field.
+    Raises ConfigError if `methods` is no list, if an entry is neither a known name nor a `Method`,
+    or if a method's tracker does not work in its field.
     """
-    chosen = []
-    check_lists(at_least=1, methods=methods)
-    for entry in methods:
-        method = entry if isinstance(entry, Method) else look_up("method", entry, METHODS)
-        check_lists(settings=method.settings)
+    found = [look_up("method", m, METHODS) if isinstance(m, str) else m for m in methods]
+    check_argument("methods", found, Sequence[Method])  # users register their own, unchecked
+    for method in found:
         tracker_class(method.tracker).check_field(field_class(method.field))
-        if method not in chosen:
-            chosen.append(method)
-    return chosen
+    return [method for place, method in enumerate(found) if method not in found[:place]]

@@ -14,7 +14,7 @@ from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.data.frame import Frame
 from nbtrack.fields import FIELDS, Field, LearnedField
 from nbtrack.machinery.device import suited_to, synchronize, usual_modes
-from nbtrack.machinery.errors import ConfigError, MissingError, NumericalError, check_kind
+from nbtrack.machinery.errors import ConfigError, MissingError, NumericalError, typed
 from nbtrack.machinery.inputs import checked_pose, whole_number
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
 from nbtrack.machinery.settings import checked
@@ -73,6 +73,7 @@ class Tracker(abc.ABC):
     is_converged: bool = False  # whether further steps in this frame would change nothing
     T_world_camera: Transform
 
+    @typed
     @usual_modes()
     def __init__(
         self,
@@ -89,11 +90,9 @@ class Tracker(abc.ABC):
         an unknown motion model; MissingError for a package that is not installed; DataError for a
         pose that is not rigid.
         """
-        check_kind(Field, field=field)
         self.check_field(field)
-        check_kind(Budget, budget=budget)
         self.settings = checked(self.Settings() if settings is None else settings, self.Settings)
-        self.field = self.prepare(deepcopy(field)).eval().requires_grad_(False)
+        self.field = self.prepare(deepcopy(field).float()).eval().requires_grad_(False)
         self.device = self.field.device
         self.budget = copy(budget)
         self.generator = torch.Generator(self.device).manual_seed(whole_number("seed", seed))
@@ -137,6 +136,7 @@ class Tracker(abc.ABC):
         """What to record about the estimate, by column name; `lost`, if given, is a judgement."""
         return {}
 
+    @typed
     @usual_modes()
     def track(self, frame: Frame, budget: Budget | None = None) -> Estimate:
         """Estimate the camera's pose at the next frame. Raises NumericalError if it is not finite.
@@ -145,8 +145,6 @@ class Tracker(abc.ABC):
         tracker that needs depth returns the pose that the motion model predicts, so that later
         frames can still be found (our choice).
         """
-        check_kind(Frame, frame=frame)
-        check_kind(Budget | None, budget=budget)
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(rigid(T_starts[0]), without_depth=True)
         if self.copes_without_depth or frame.has_depth:

@@ -13,7 +13,7 @@ from nbtrack.core.arrays import Poses
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery import files
 from nbtrack.machinery.device import advise_on_memory
-from nbtrack.machinery.errors import DataError, check_kind
+from nbtrack.machinery.errors import DataError, typed
 from nbtrack.machinery.settings import as_dict
 from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
@@ -32,10 +32,11 @@ class Trajectory:
     metrics: dict[str, Any] = field(default_factory=dict)  # of a finished run that was written
 
 
+@typed
 def track_sequence(
     tracker: Tracker,
     sequence: RgbdSequence,
-    checkpoint: Path | None = None,
+    checkpoint: Path | str | None = None,
     on_frame: Callable[[int, float], object] = lambda index, error_m: None,
     is_start_known: bool = True,
 ) -> Trajectory:
@@ -95,7 +96,6 @@ def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> d
 
 def _check_trackable(sequence: RgbdSequence) -> None:
     """Raises DataError for fewer than two frames, or if no frame has a measured depth."""
-    check_kind(RgbdSequence, sequence=sequence)
     if len(sequence) < 2:
         raise DataError(f"{sequence!r} is too short to track: give at least two frames")
     if not sequence.depths_mm.any():
