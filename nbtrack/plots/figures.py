@@ -135,15 +135,14 @@ def plot_along_ray(
 ) -> Figure:
     """Curves over the z-depths (m) of a ray's samples, and vertical lines at the depths of `marks`.
 
-    A curve may be shorter than `depths`, as weights of sections, which have one value less. The
-    curve labelled "true" is dashed. `marks` are depths (m) by label.
+    A curve may be shorter than `depths`, as weights of sections, which have one value less. `marks`
+    are depths (m) by label.
     """
     index = depths.cpu().numpy()
     columns = {label: pd.Series(c.detach().cpu(), index[: len(c)]) for label, c in curves.items()}
     axes = style.new_axes(title, 2.7)[0, 0]
-    dashes = ["--" if label == "true" else "-" for label in columns]
-    look = {"style": dashes, "color": style.method_colors(columns)}
-    pd.DataFrame(columns).plot(ax=axes, xlabel="depth (m)", ylabel=ylabel, **look)
+    colors = style.method_colors(columns)
+    pd.DataFrame(columns).plot(ax=axes, xlabel="depth (m)", ylabel=ylabel, color=colors)
     for label, depth in marks.items():
         axes.axvline(depth, label=label, **style.DASHED)
     axes.legend()
@@ -162,8 +161,8 @@ def plot_columns(tables: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     grid = style.new_axes(title, height, n_rows, len(tables), sharex="col", sharey="row")
     for column, (heading, table) in zip(grid.T, tables.items(), strict=True):
         column[0].set_title(heading)
-        for axes, (name, color) in zip(column, style.method_colors(table).items(), strict=True):
-            axes.plot(table[name].dropna(), color=color)
+        for axes, name in zip(column, table, strict=True):
+            axes.plot(table[name].dropna())
             axes.set(xlabel=table.index.name, ylabel=name)
             axes.label_outer()
     return grid[0, 0].figure
@@ -175,15 +174,13 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
 
     `frames` maps methods to the rows of their runs' frames.csv, all of the same frames. The dashed
     line is the ATE of 0.2 m above which the paper prints a sequence in red; the dotted one is the
-    error of a camera that stands still. The legend explains both lines. Curves have their names at
-    their ends.
+    error of a camera that stands still.
     """
     above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
     draw_errors(above, frames)
     for label, color in style.method_colors(frames).items():
         below.plot(frames[label]["frame_id"], frames[label]["rotation_error_deg"], color=color)
-    above.margins(x=0)  # labels at the ends of curves stand beside the axes
-    above.axhline(100 * LOST_THRESHOLD_M, label="0.2 m (the paper's limit for ATE)", **style.DASHED)
+    above.axhline(100 * LOST_THRESHOLD_M, label="0.2 m (paper's limit for ATE)", **style.DASHED)
     below.set(ylabel="rotation error (degrees)", xlabel="frame")
     return above.figure.legend_below()
 
@@ -191,18 +188,11 @@ def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
 def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
     """Draw the position errors (cm) of runs by frame, and those of a camera that stands still.
 
-    `frames` are as in `plot_errors`. Several curves have their labels at their ends; a single one
-    has its label in the legend.
+    `frames` are as in `plot_errors`.
     """
-    is_alone = len(frames) == 1
     for label, color in style.method_colors(frames).items():
         error_cm = 100 * frames[label]["translation_error_m"]
-        index = frames[label]["frame_id"]
-        axes.plot(index, error_cm, color=color, label=label if is_alone else "")
-        last = error_cm.last_valid_index()
-        if last is not None and not is_alone:
-            end = index[last], error_cm[last]
-            axes.annotate(label, end, (5, 0), textcoords="offset points", color=color, va="center")
+        axes.plot(frames[label]["frame_id"], error_cm, color=color, label=label)
     still = list(frames.values())[-1]  # the same in every run of these frames
     axes.plot(still["frame_id"], 100 * still["still_error_m"], label=STANDING_STILL, **style.DOTTED)
     axes.set_ylabel("translation error (cm)")

@@ -63,8 +63,6 @@ def plot_idea(
             _draw_queries(axes, field, T, points_camera, page_camera)
         else:
             _draw_samples(axes, field, T, point_camera)
-        # Without points: an entry in the legend for the surface that `draw_slice` drew.
-        axes.plot([], [], "k-", label=f"surface of {field.label}")
         axes.set(xlim=x[[0, -1]], ylim=(-_ASIDE, _ASIDE), aspect="equal", title=name)
         axes.set(xlabel="along the ray (m)", ylabel="to its left (m)")
         axes.label_outer()

@@ -18,7 +18,8 @@ from nbtrack.plots.meshes import query_field
 from nbtrack.plots.style import DASHED, method_colors, new_axes, styled
 from nbtrack.tracking import SdfTracker, StepBudget, Tracker, VrTracker
 
-_SDF_LOSS, _VR_LOSS, _DENSITY = "SDF's loss (no unit)", "VR's loss (no unit)", "mean density (1/m)"
+_SDF_LOSS, _VR_LOSS = "SDF's loss (no unit)", "VR's loss (no unit)"
+_DISTANCE, _DENSITY = "mean |d| (cm)", "mean density (1/m)"
 _OFFSETS_CM = np.arange(-20, 21, 2)
 _COLORS = dict(zip((_SDF_LOSS, _VR_LOSS), method_colors(["SDF", "VR"]).values(), strict=True))
 
@@ -37,9 +38,9 @@ def pose_losses(
     """Losses of both trackers for a frame, over offsets of the camera from its true pose.
 
     The camera is moved along its x axis (the index, in cm) and turned about its y axis by `y_deg`.
-    The columns are SDF's loss in the map `distance`, VR's loss in the map `density`, and the mean
-    density at the measured points. Losses are those of trackers with default settings, for the same
-    pixels at all poses and without randomness.
+    The columns are SDF's loss in the map `distance`, VR's loss in the map `density`, and the means
+    of |d| and of the density at the measured points. Losses are those of trackers with default
+    settings, for the same pixels at all poses and without randomness.
     """
     pixels = frame.measured_pixels()
     # About 128 pixels give smooth curves, and are fast enough for a slider.
@@ -55,9 +56,12 @@ def pose_losses(
         T_world_camera = move_sideways(frame, x_cm, y_deg)
         sdf_loss = sdf.loss(T_world_camera, directions_camera, color, depth)
         vr_loss = vr.loss(T_world_camera, directions_camera, color, depth)
-        _, densities = density(transform_points(T_world_camera, points_camera))
-        losses.append([sdf_loss.item(), vr_loss.item(), densities.mean().item()])
-    return pd.DataFrame(losses, pd.Index(_OFFSETS_CM, name="x_cm"), [_SDF_LOSS, _VR_LOSS, _DENSITY])
+        points_world = transform_points(T_world_camera, points_camera)
+        mean_cm = 100 * distance(points_world)[1].abs().mean().item()
+        mean_density = density(points_world)[1].mean().item()
+        losses.append([sdf_loss.item(), vr_loss.item(), mean_cm, mean_density])
+    columns = [_SDF_LOSS, _VR_LOSS, _DISTANCE, _DENSITY]
+    return pd.DataFrame(losses, pd.Index(_OFFSETS_CM, name="x_cm"), columns)
 
 
 @styled
@@ -89,18 +93,17 @@ def plot_pose_losses(
         axes.plot(x_cm + tangent_cm, loss + gradient * tangent_cm, color="0.3", **look)
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
-        axes.legend(loc="upper left")
-    return panels[0].figure
+    return panels[0].figure.legend_below()
 
 
 @styled
 def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
-    """SDF's loss and the mean density of `pose_losses`, with a dot where each is best.
+    """The means of |d| and of the density of `pose_losses`, with a dot where each is best.
 
-    A search would end where the loss is lowest, or where the density is highest.
+    A search would end where |d| is lowest, or where the density is highest.
     """
     # For each column the kind of extreme that a search looks for, and its place (cm).
-    extremes = {_SDF_LOSS: ("lowest", curves[_SDF_LOSS].idxmin())}
+    extremes = {_DISTANCE: ("lowest", curves[_DISTANCE].idxmin())}
     extremes[_DENSITY] = "highest", curves[_DENSITY].idxmax()
     panels = new_axes(title, 2.9, 1, 2)[0]
     for axes, name, color in zip(panels, extremes, _COLORS.values(), strict=True):

@@ -31,34 +31,30 @@ def plot_slice(
 ) -> Figure:
     """The values of a field on a horizontal plane, `height` metres up, seen from above.
 
-    Several fields of one recording are drawn side by side, with the colour scale of the last.
+    Several fields of one recording are drawn side by side, with the colour scale of the first.
     `sequence` holds the frames that the maps were made from; the default `height` is the mean of
     its cameras. If the exact `room` is known, its surface is a thin green line, and its exact
-    distance is drawn before the fields. The axes cover the camera path and what the frames have
-    seen (inside the room). Spots that only a few rays have seen count as not seen.
+    distance is drawn before the fields, so that it sets the scale. The axes cover the camera path
+    and what the frames have seen (inside the room). Spots that only a few rays have seen count as
+    not seen.
     """
     drawn = [fields] if isinstance(fields, Field) else [*fields]
     if room is not None and drawn[0].is_distance:
         drawn.insert(0, ExactDistance(room, drawn[0]))
     panels = new_axes(title, 5.4 - 0.8 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
-    norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # those of the last, for all
+    norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # those of the first, for all
     mean_m = np.nanmean(sequence.T_world_camera[:, :3, 3] @ scene.up_of(sequence.T_world_camera))
     height = mean_m if height is None else height
     above = f", {mean_m - height:.1f} m higher up" if abs(mean_m - height) > 0.05 else ""
-    for axes, field in zip(panels[::-1], drawn[::-1], strict=True):
+    for axes, field in zip(panels, drawn, strict=True):
         up, page = scene.draw_from_above(axes, {f"cameras{above}": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
         step = (high - low).max() / 240  # m
         points, places = _level_grid(page, low, high + step, step, height * up)
         is_seen = binary_opening(seen_by(points, sequence), iterations=2)  # without small spots
         norm = scene.draw_slice(axes, field, points, places, is_seen, norm, **bar)
-        name, _, unit = field.value_label.partition(" ")
-        what = f": {name} of {field.surface_level:g}{unit.strip('(1)')}"
-        # Without points: an entry in the legend for the surface that `draw_slice` drew.
-        axes.plot([], [], "k-", label="surface" if field.is_distance else f"surface{what}")
         if room is not None:
             is_seen = is_seen & _draw_true_level(axes, room, points, places)
-        axes.plot([], [], "s", color=scene.UNSEEN, label="hardly or never seen")
         axes.set_title(f"{field.label}, {height:.2f} m up")
         _end_around(axes, places[is_seen], sequence.T_world_camera[:, :3, 3] @ page.T)
     return panels[0].figure.legend_below()
@@ -128,7 +124,7 @@ def plot_map_and_slice(
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    left, middle, right = new_axes(title, 3.2, 1, 3, width_ratios=[1.3, 1.3, 1.1])[0]
+    left, middle, right = new_axes(title, 3.2, 1, 3, width_ratios=[1.5, 1.5, 1.0])[0]
     left.figure.get_layout_engine().set(wspace=0.08)
     middle.sharex(left)
     middle.sharey(left)
@@ -149,12 +145,13 @@ def plot_map_and_slice(
         scene.draw_paths(axes, T_paths, to_page, 0.7)
         axes.set_title(name)
     scene.draw_scale(left, middle)
+    left.margins(0.01)
     first, *others = paths
     for label in others:
         off_mm = 1000 * np.linalg.norm(paths[label] - paths[first], axis=1)
         right.plot(off_mm, color=method_colors(paths)[label])
-    right.set(title="error", xlabel="frame", ylabel=f"off the {first} path (mm)", ylim=(0, None))
-    return left.figure.legend_below()
+    right.set(xlabel="frame", ylabel="position error (mm)", ylim=(0, None))
+    return left.figure.legend_below(panel=1)
 
 
 @styled

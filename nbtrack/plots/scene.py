@@ -24,8 +24,8 @@ from nbtrack.plots.style import method_colors
 Paths = Mapping[str, Poses]  # camera-to-world poses (m) by label
 _ELEVATION = np.radians(45)  # of the viewer of a mesh, above the horizon
 _AMBIENT = 0.75  # share of the light on a mesh that comes from all sides
-UNSEEN = "0.82"
-"""The grey of what no frame has seen; no colour scale of values contains grey."""
+# The grey of what no frame has seen; no colour scale of values contains grey.
+_UNSEEN = "0.82"
 # The share of a cloud's points left out at either end of each axis: a few wrong depths would
 # otherwise make the room look small.
 _CUT = 0.01
@@ -168,11 +168,10 @@ def draw_slice(
 ) -> Normalize:
     """Draw a field's values at a grid of points (m, world frame), at `places` (m) on the page.
 
-    A signed distance is blue in free space and red in solids, with thin lines 0.25 m apart. A
-    density or an occupancy has a logarithmic colour scale. The surface, at the field's
-    `surface_level`, is a black line. Points that are not `seen` are grey, since there the field is
-    not supported by data. `bar` holds options of `Figure.colorbar`. Returns the colour scale; if
-    that of another slice is given as `norm`, it is used and no bar is drawn.
+    A signed distance is blue in free space and red in solids, with thin lines 0.25 m apart. Other
+    values have a logarithmic colour scale. The surface is a black line; what is not `seen` is grey.
+    All have labels for a legend. `bar` holds options of `Figure.colorbar`. Returns the colour
+    scale; if that of another slice is given as `norm`, it is used and no bar is drawn.
     """
     _, values = query_field(field, points)
     level = field.surface_level
@@ -192,11 +191,20 @@ def draw_slice(
         draw_levels(axes, places, values, _LINES_M, colors=tones, linewidths=0.4, linestyles="-")
         axes.hlines([], 0, 0, "0.35", linewidth=0.6, label="every 0.25 m")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
+    name, _, unit = field.value_label.partition(" ")
+    what = "" if field.is_distance else f": {name} of {level:g}{unit.strip('(1)')}"
+    axes.hlines([], 0, 0, "black", linewidth=1.4, label=f"surface{what}")
     if seen is not None:
-        veil = np.full((*seen.shape, 4), float(UNSEEN))  # red, green, blue, opacity
-        veil[..., 3] = ~seen  # transparent over what was seen
-        axes.pcolormesh(*xy, veil, gid="unseen", zorder=2.5, **look)  # above the slice's lines
+        _draw_veil(axes, xy, seen, **look)
     return image.norm
+
+
+def _draw_veil(axes: Axes, xy: np.ndarray, seen: np.ndarray, **look: object) -> None:
+    """Cover what was not seen, where data do not support the field, with grey."""
+    veil = np.full((*seen.shape, 4), float(_UNSEEN))  # red, green, blue, opacity
+    veil[..., 3] = ~seen  # transparent over what was seen
+    axes.pcolormesh(*xy, veil, gid="unseen", zorder=2.5, **look)  # above the slice's lines
+    axes.fill([], [], color=_UNSEEN, label="hardly or never seen")
 
 
 def draw_levels(

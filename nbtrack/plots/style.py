@@ -87,12 +87,12 @@ class NotebookFigure(Figure):
         return picture.getvalue()
 
     @styled
-    def legend_below(self) -> "NotebookFigure":
-        """Draw a legend below all panels, from the labels of the first; returns the figure.
+    def legend_below(self, panel: int = 0) -> "NotebookFigure":
+        """Draw a legend below all panels, from the labels of one of them; returns the figure.
 
         The legend has one row, or three columns if its labels are long.
         """
-        handles, labels = self.axes[0].get_legend_handles_labels()
+        handles, labels = self.axes[panel].get_legend_handles_labels()
         ncols = 3 if len("".join(labels)) > 100 else len(labels)
         self.legend(handles, labels, loc="outside lower center", ncols=ncols, handlelength=3)
         return self
