@@ -275,6 +275,20 @@ def test_a_map_of_the_cache_stays_as_it_was_read() -> None:
     assert other.record["quality"]
 
 
+def test_a_recording_stays_as_it_was_read() -> None:
+    """Catches a change of poses that were handed out in what the next reader gets."""
+    recording = scenes()["scenes"][0].recording
+    known, origin = recording.T_world_camera.copy(), recording.origin.copy()
+    for array in (recording.T_world_camera, recording.has_pose, recording.origin):
+        array[:] = 7
+    for array in (recording.times, recording.file_poses):
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = 7
+    assert np.array_equal(recording.T_world_camera, known)
+    assert np.array_equal(recording.origin, origin)
+    assert recording.has_pose.all()
+
+
 OTHERS: dict[str, dict] = {
     "recording": {"sequence": box_sequence([[0, 0.002 * i, 0] for i in range(4)])},
     "map": {"field": mapped().field}, "budget": {"budget": 4}, "settings": {"lambda_color": 0.1},

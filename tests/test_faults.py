@@ -64,6 +64,16 @@ def _cut(path: str) -> Callable[[], None]:
     return cut
 
 
+def _put(name: str, value) -> Callable[[], None]:
+    """Another value of an entry in a run's metrics."""
+
+    def put() -> None:
+        path = Path("run/metrics.json")
+        path.write_text(json.dumps(json.loads(path.read_text()) | {name: value}))
+
+    return put
+
+
 def _killed(kind: str, finished: str, checkpoint: str, content) -> Callable[[], None]:
     """What a killed command leaves in the cache, but with another content of its checkpoint."""
 
@@ -118,6 +128,10 @@ FILES = {
     "another order": (_write(TRAJECTORY, "0.5 0 0 1 1 2 3 4"), KITTI, "of norm 5.48"),
     "unfinished run": (_gone(RUN), KITTI, "no finished run in run"),
     "mesh cut": (_cut("map/mesh.ply"), MESH, "not a readable mesh"),
+    "no entries": (_write(RUN, "{}"), KITTI, "run is not a readable run"),
+    "a number for a map": (_put("map", 3), [*MESH[:1], "run", *MESH[2:]], "metrics.json is 3"),
+    "a text for an origin": (_put("origin", "000"), KITTI, "metrics.json is '000'"),
+    "other columns": (_write("run/frames.csv", "a\n" + 4 * "1\n"), KITTI, "run is not a readable"),
 }
 Fault = tuple[Callable[[], object], list[str], str]  # what is spoilt, the command, what it says
 FAULTS: dict[str, Fault] = {**FILES}

@@ -18,7 +18,7 @@ from nbtrack.experiments.presets import SIZES, Preset, ScenesConfig, load_preset
 from nbtrack.experiments.scenes import Scene, open_scene, write_room
 from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.machinery.errors import ConfigError, DataError
-from nbtrack.machinery.files import data_folder, write_atomic
+from nbtrack.machinery.files import absolute, data_folder, write_atomic
 from nbtrack.machinery.progress import tell
 from nbtrack.machinery.settings import flat, with_values
 from nbtrack.mapping.files import MESH_FILE, Map
@@ -116,7 +116,7 @@ def track_command(options: Namespace) -> None:
     for line in _summary(metrics):
         print(f"  {line}")
     print(f"  files  {folder}: trajectory.txt (TUM), overview.png, metrics.json with all numbers")
-    print(f"  next   nbtrack export {shlex.quote(str(folder))} --to gif tracking.gif")
+    print(f"  next   nbtrack export {shlex.quote(str(absolute(folder)))} --to gif tracking.gif")
     _warn(metrics)
 
 

@@ -15,7 +15,7 @@ from scipy.special import ndtri, stdtrit
 
 from nbtrack.beyond.verdict import score_detection
 from nbtrack.machinery import files
-from nbtrack.machinery.errors import ConfigError, MissingError
+from nbtrack.machinery.errors import ConfigError, MissingError, check_argument
 from nbtrack.machinery.inputs import read_object
 from nbtrack.mapping.files import HISTORY_FILE, MAP_FILE, MESH_FILE
 from nbtrack.plots.style import in_house_style
@@ -33,6 +33,10 @@ MARK = ".nbtrack"
 # The last file of each is written last, as the sign that the others are there.
 FILES_OF_RUN = ("trajectory.txt", "groundtruth.txt", "frames.csv", OVERVIEW_FILE, METRICS_FILE)
 FILES_OF_MAP = (HISTORY_FILE, MESH_FILE, MAP_FILE)
+# What exports use of a run: columns of its frames, and entries of its metrics.
+_COLUMNS = ["frame_id", "time", "translation_error_m", "without_depth"]
+_ENTRIES = dict.fromkeys(("map", "map_key", "recording", "scene", "tracker"), str)
+_ENTRIES |= {"format": str | None, "origin": tuple[float, float, float]}
 _RESULTS = (*FILES_OF_RUN, *FILES_OF_MAP, CHECK_FILE, "table_[123]*")
 
 
@@ -115,18 +119,21 @@ def read_trajectory(folder: Path) -> Trajectory:
     """
     if not (folder / METRICS_FILE).is_file():
         raise MissingError(f"no finished run in {folder}: give a folder that `track` wrote")
-    times, T_estimated = read_tum(folder / "trajectory.txt")
-    T_true = np.full_like(T_estimated, np.nan)
-    truth = folder / "groundtruth.txt"
-    if truth.is_file():
-        times_known, T_known = read_tum(truth)
-        T_true[np.searchsorted(times, times_known)] = T_known  # rows of the same times
-    metrics = read_object(folder / METRICS_FILE)
-    with files.naming_damaged(folder / "frames.csv", "table of frames", "track again"):
+    with files.naming_damaged(folder, "run", "track again"):
+        times, T_estimated = read_tum(folder / "trajectory.txt")
+        T_true = np.full_like(T_estimated, np.nan)
+        truth = folder / "groundtruth.txt"
+        if truth.is_file():
+            times_known, T_known = read_tum(truth)
+            T_true[np.searchsorted(times, times_known)] = T_known  # rows of the same times
         frames = pd.read_csv(folder / "frames.csv")
+        frames[_COLUMNS].astype(float)  # raises for other columns
         if len(frames) != len(T_estimated):
             raise ValueError(f"{len(frames)} rows for {len(T_estimated)} poses")
-    to_origin = -np.array(metrics.get("origin", [0, 0, 0]))
+        metrics = read_object(folder / METRICS_FILE)
+        for name, kind in _ENTRIES.items():
+            check_argument(f"{name} in {folder / METRICS_FILE}", metrics[name], kind)
+        to_origin = -np.array(metrics["origin"])
     return Trajectory(shifted(T_estimated, to_origin), shifted(T_true, to_origin), frames, metrics)
 
 

@@ -13,7 +13,6 @@ import torch
 from nbtrack import provenance
 from nbtrack.checks.in_map import check_belongs, in_world_of_map, outside_map_share
 from nbtrack.core.arrays import Pose, Poses
-from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments.jobs import Job, Report
 from nbtrack.experiments.map_jobs import MapJob, map_unit
@@ -145,7 +144,7 @@ class TrackJob(Job):
         finished = self.needs.map()
         origin = np.array(finished.record["origin"])
         sequence = self.scene.read(self.frames, needs_poses=False, origin=origin)
-        warning = self._map_warning(finished, sequence[0])
+        warning = self._map_warning(finished, sequence)
 
         def report_frame(done: int, error_m: float) -> None:
             status = f"frame {done}" if np.isnan(error_m) else f"off by {100 * error_m:.1f} cm"
@@ -174,8 +173,8 @@ class TrackJob(Job):
         """Whether the run starts at the first frame's pose; if not, the camera is found first."""
         return self.start == "given" and bool(np.isfinite(T_first).all())
 
-    def _map_warning(self, finished: Map, first: Frame) -> str | None:
-        """A warning if a given map may not fit the first frame of the recording; None if it fits.
+    def _map_warning(self, finished: Map, sequence: RgbdSequence) -> str | None:
+        """A warning if a given map may not fit the first frame with a pose; None if it fits.
 
         If the frame has no depth, the warning says that the fit cannot be checked. If the map does
         not fit at the recording's pose, it is `_OTHER_WORLD`; a run that starts at that pose raises
@@ -183,12 +182,13 @@ class TrackJob(Job):
         """
         # A map that was made here is not checked. It is of the right room, and a path in the room
         # may begin where the map does not reach.
-        if not self.needs.given or first.T_world_camera is None:
+        posed = np.flatnonzero(np.isfinite(sequence.T_world_camera).all(axis=(1, 2)))
+        if not (self.needs.given and len(posed)):
             return None
         try:
-            return check_belongs(finished, first)
+            return check_belongs(finished, sequence[posed[0]])
         except DataError:
-            if self.start == "given":
+            if self._starts_at(sequence.T_world_camera[0]):
                 raise
             return _OTHER_WORLD
 

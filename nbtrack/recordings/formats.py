@@ -126,7 +126,7 @@ class Format:
         for pattern in patterns:
             if files := files_of(folder, pattern):
                 return files
-        needed = f"{self.label} needs {' or '.join(patterns)}"
+        needed = f"{self.label} needs {' or '.join(dict.fromkeys(patterns))}"
         advice = "add it, or name another format with --format"
         raise MissingError(f"no {what} in {folder}: {needed}; {advice}")
 

@@ -1,7 +1,6 @@
 """Open a recording: find and pair its files, and read its poses and calibration, but no image."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -36,20 +35,24 @@ class Recording:
     file_poses: Poses
     pose_file: Path | None = None  # for messages; with `*` if every frame has a file of its own
 
+    def __post_init__(self) -> None:
+        """Lets nobody change the arrays in place: all who use the recording share them."""
+        self.times.flags.writeable = self.file_poses.flags.writeable = False
+
     def __len__(self) -> int:
         return len(self.color_files)
 
-    @cached_property
+    @property
     def T_world_camera(self) -> Poses:
         """Camera-to-world poses (m) with OpenCV's camera axes; NaN for frames without a pose."""
         return self.declared.poses_to_opencv(self.file_poses)
 
-    @cached_property
+    @property
     def has_pose(self) -> Bool[np.ndarray, "frames"]:
         """Which frames have a pose."""
         return np.isfinite(self.file_poses).all(axis=(1, 2))
 
-    @cached_property
+    @property
     def origin(self) -> Position:
         """The point (m, world) that is subtracted from all positions in sequences.
 
