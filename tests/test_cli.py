@@ -264,17 +264,14 @@ def test_a_line_now_and_then(clock, capsys) -> None:
     assert {*others} == {"mapping: 100 %, 01:30 gone, 00:00 left, loss 0.5"}
 
 
-def test_a_warm_up_is_left_out(clock, capsys) -> None:
+def test_a_slow_start_is_forgotten(clock, capsys) -> None:
     """Catches hours that are left for half an hour, because the first frame was compiled."""
     with ProgressBar("tracking", 60) as bar:
-        clock.now = 600
-        bar.end_warm_up(1)
-        bar.move_to(1)
-        clock.now = 631
-        bar.move_to(2)
-    first, second, *_ = capsys.readouterr().err.splitlines()
-    assert "? left" in first
-    assert "29:58 left" in second  # 58 times 31 s
+        for frame in range(50):
+            clock.now = 600 + 31 * frame
+            bar.move_to(frame + 1)
+    *_, last, _ = capsys.readouterr().err.splitlines()
+    assert "05:10 left" in last  # 10 times 31 s
 
 
 def test_short_and_hidden_work_is_silent(clock, capsys) -> None:

@@ -173,7 +173,7 @@ def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -
         found = f"{options.map_from} is a map of field {given.field!r}, not {field!r}"
         raise ConfigError(f"{found}: leave --method and --field out")
     of_map, wanted = flat(given.setting_tree), flat(preset.settings)
-    asked_keys = {key for key, _ in preset.chosen}  # by --set, --config or NBTRACK_SET
+    asked_keys = {*preset.chosen}  # by --set, --config or NBTRACK_SET
     if options.method:  # its name says whether the map is corrected
         asked_keys.add(f"correction.{field}")
     for key in sorted(asked_keys & of_map.keys()):  # a map has no settings of a tracker

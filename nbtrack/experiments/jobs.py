@@ -118,9 +118,6 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
         """Move the bar; `running` has by folder the share of work done and the status of a job."""
         ended = sum(missing[folder].work for folder in outcomes)
         worked = ended + sum(missing[folder].work * share for folder, (share, _) in running.items())
-        # Compilation makes the first frame slow, which says nothing of the time that is left.
-        if worked > ended and not bar.warm_up_work:
-            bar.end_warm_up(worked)
         first, *_ = running  # the job whose status is shown
         bar.set_description_str(missing[first].doing, refresh=False)
         status = f"{missing[first].name}: {running[first][1]}"

@@ -10,7 +10,6 @@ import shlex
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +23,6 @@ from nbtrack.synthetic import REPORTED_ROOMS
 from nbtrack.synthetic.make import MOTIONS
 from nbtrack.tables import PAPER_PIXELS
 from nbtrack.tracking import TRACKERS, TrackerSettings
-
-Values = tuple[tuple[str, Any], ...]  # dotted keys and values
-Classes = tuple[tuple[str, type], ...]  # names of fields or trackers and the classes they name
 
 
 @dataclass(frozen=True)
@@ -75,17 +71,19 @@ _MODELS = {"network": "neus", "mapping": "neus", "tracking": "sdf"}
 class Preset:
     """All settings of a run: those of a named preset with the changes of a method and of the user.
 
-    Changes are sorted pairs of a dotted key and a value, which were checked.
+    Both kinds of changes are values by dotted keys, which were checked.
     """
 
     name: str
-    of_method: Values = ()  # changes by the method that is run
-    chosen: Values = ()  # changes by the user, which win over the method's
+    of_method: dict[str, Any] = field(default_factory=dict)  # changes by the method that is run
+    chosen: dict[str, Any] = field(default_factory=dict)  # by the user; they win over the method's
 
     @property
     def settings(self) -> dict[str, Any]:
         """All settings as a tree, for the fields and trackers that are registered now."""
-        return _merged(self, tuple(FIELDS.items()), tuple(TRACKERS.items()))
+        tree, changes = default_settings(), _CHANGES[self.name]
+        of_unnamed = _changes_of_unnamed(changes, tree)
+        return with_values(tree, of_unnamed | changes | self.of_method | self.chosen)
 
     def with_values(self, values: Mapping[str, Any]) -> "Preset":
         """The preset with values that a user chose, by dotted keys.
@@ -101,14 +99,13 @@ class Preset:
                 # could suggest a key of a field or tracker that is not meant.
                 look_up(f"config key, {part} of", names[0], known)
         checked = flat(with_values(tree, values))
-        chosen = dict(self.chosen) | {key: checked[key] for key in values}
-        return replace(self, chosen=tuple(sorted(chosen.items())))
+        return replace(self, chosen=self.chosen | {key: checked[key] for key in values})
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
         """The preset with the `key=value` texts of a method; values that a user chose stay."""
         # The plain preset checks the texts; its chosen values are then those of the method.
-        of_method = dict(self.of_method) | dict(with_settings(PRESETS[self.name], *settings).chosen)
-        return replace(self, of_method=tuple(sorted(of_method.items())))
+        method = with_settings(PRESETS[self.name], *settings)
+        return replace(self, of_method=self.of_method | method.chosen)
 
     @property
     def scenes(self) -> ScenesConfig:
@@ -164,36 +161,18 @@ PRESETS = {name: Preset(name) for name in _CHANGES}
 
 def default_settings() -> dict[str, Any]:
     """The tree of the defaults of all settings classes, for the fields and trackers known now."""
-    return _defaults(tuple(FIELDS.items()), tuple(TRACKERS.items()))
-
-
-@lru_cache(maxsize=1)
-def _defaults(fields: Classes, trackers: Classes) -> dict[str, Any]:
-    """The tree of the defaults of all settings classes, for these fields and trackers."""
-    learned = {name: kind for name, kind in fields if issubclass(kind, LearnedField)}
+    learned = {name: kind for name, kind in FIELDS.items() if issubclass(kind, LearnedField)}
     # Fields with a class of network settings of their own.
     networks = {n: k.Network() for n, k in learned.items() if k.Network is not NetworkSettings}
     return {
         "network": _NETWORKS | networks,
-        "mapping": {name: kind.Settings() for name, kind in fields},
+        "mapping": {name: kind.Settings() for name, kind in FIELDS.items()},
         # Only maps of a distance can be corrected. The size of the cells (m); 0: no correction.
         "correction": {name: 0.0 for name, kind in learned.items() if kind.is_distance},
-        "tracking": {name: kind.Settings() for name, kind in trackers},
+        "tracking": {name: kind.Settings() for name, kind in TRACKERS.items()},
         "scenes": ScenesConfig(),
         "tables": TablesConfig(),
     }
-
-
-@lru_cache(maxsize=64)
-def _merged(preset: Preset, fields: Classes, trackers: Classes) -> dict[str, Any]:
-    """The tree of all settings of a preset, for these fields and trackers.
-
-    Later changes win over earlier ones: those that the preset makes in fields and trackers that it
-    does not name, those in what it names, those of the method, those of the user.
-    """
-    tree, changes = _defaults(fields, trackers), _CHANGES[preset.name]
-    of_unnamed = _changes_of_unnamed(changes, tree)
-    return with_values(tree, of_unnamed | changes | dict(preset.of_method) | dict(preset.chosen))
 
 
 def _changes_of_unnamed(changes: dict[str, Any], tree: dict[str, Any]) -> dict[str, Any]:

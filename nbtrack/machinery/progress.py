@@ -68,10 +68,6 @@ class ProgressBar(tqdm):
     It is used in a `with` block with `move_to`, or as an iterator over a collection.
     """
 
-    # Work done and seconds gone in a warm-up, whose speed says nothing of the rest.
-    warm_up_work: float | int = 0
-    warm_up_seconds = 0.0
-
     def __init__(self, title: str, work: float | Collection, is_shown: bool = True) -> None:
         """Begin a bar over a collection, or over an amount of work in any unit.
 
@@ -86,21 +82,6 @@ class ProgressBar(tqdm):
         options |= {"disable": not is_shown, "delay": _DELAY_SECONDS, "miniters": 0, "ascii": False}
         work_of = "iterable" if isinstance(work, Collection) else "total"
         super().__init__(desc=title, **{work_of: work}, **options)
-
-    @property
-    def format_dict(self) -> dict[str, Any]:
-        """tqdm's values to show, with the mean speed after the warm-up as its rate.
-
-        tqdm computes the time that is left from this rate.
-        """
-        values = super().format_dict
-        seconds = values["elapsed"] - self.warm_up_seconds
-        return values | {"rate": (self.n - self.warm_up_work) / max(seconds, 1e-3)}
-
-    def end_warm_up(self, done: float | int) -> None:
-        """Leave the work that is done by now, and the time until now, out of the mean speed."""
-        self.warm_up_work = done
-        self.warm_up_seconds = self.format_dict["elapsed"]
 
     def move_to(self, done: float | int, status: str = "") -> None:
         """Show how much of the work is done, and a word on how it goes."""

@@ -44,9 +44,10 @@ def with_settings(preset: Any, *settings: str) -> Any:
     The preset may be any object with a method `with_values`. Raises ConfigError for a text that is
     no `key=value`, an unknown key, or a value of the wrong type or range.
     """
+    values = {}
     for setting in settings:
-        preset = preset.with_values(read_setting(setting))
-    return preset
+        values |= read_setting(setting)
+    return preset.with_values(values)
 
 
 def read_setting(setting: str) -> dict[str, Any]:
