@@ -80,7 +80,6 @@ COLUMNS = pd.DataFrame({"a (m)": [1.0, 2.0], "b (cm)": [3.0, 4.0]}).rename_axis(
 FIGURES = {
     "network": lambda s: plot_network(IMAP_FIELD.mlp, "density (1/m)", "eight wide"),
     "frame": lambda s: plots.plot_frame(s, 3, "one"),
-    "views": lambda s: plots.plot_views(s, [0, 3], [(s.color(0), s.depth(0) + 0.02)] * 2, "x"),
     "ray": lambda s: plots.plot_along_ray(AT, {"true": RAY, "b": RAY[:-1]}, END, "end", "d (m)"),
     "columns": lambda s: plots.plot_columns({"one": COLUMNS, "two": 2 * COLUMNS}, "rise"),
     "slice": lambda s: plots.plot_slice(SPHERE, s, 0.0, title="round"),
@@ -297,12 +296,11 @@ def test_errors_are_those_of_their_frames() -> None:
     assert still.get_ydata() == pytest.approx([2.0, 4.0])
 
 
-def test_unmeasured_pixels_are_not_errors(sequence) -> None:
-    """Catches missing depth taken for a depth of zero."""
-    view = sequence.color(0), np.full((12, 16), 1.02, np.float32)
-    error_cm = plots.plot_views(sequence, [0], [view]).axes[4].images[0].get_array()
-    assert error_cm.mask.sum() == 1
-    assert error_cm.compressed() == pytest.approx(2.0, abs=1e-3)
+def test_unmeasured_pixels_have_no_depth(sequence) -> None:
+    """Catches missing depth taken for a depth of zero, and millimetres for metres."""
+    depth = plots.plot_frame(sequence, 0).axes[1].images[0].get_array()
+    assert depth.mask.sum() == 1
+    assert depth.compressed() == pytest.approx(1.0, abs=1e-3)
 
 
 def test_a_movie_shows_every_frame(sequence) -> None:

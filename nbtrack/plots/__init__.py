@@ -13,7 +13,6 @@ from nbtrack.plots.figures import (
     plot_frame,
     plot_images,
     plot_panels,
-    plot_views,
 )
 from nbtrack.plots.movie import cloud_of, movie_bytes, movie_pictures
 from nbtrack.plots.pose_losses import plot_steps

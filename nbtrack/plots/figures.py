@@ -1,6 +1,6 @@
 """Figures of images, measured and rendered, and figures of numbers as curves and points."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import chain, cycle
 
 import matplotlib
@@ -13,12 +13,11 @@ from matplotlib.image import AxesImage
 from nbtrack.core.arrays import Values
 from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.data.sequence import RgbdSequence
-from nbtrack.fields.base import View
 from nbtrack.plots import style
 from nbtrack.tables import STANDING_STILL
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
-DEPTH, DEPTH_ERROR, DISTANCE = "depth (m)", "depth error (cm)", "|signed distance| (cm)"
+DEPTH, DISTANCE = "depth (m)", "|signed distance| (cm)"
 # With `panchor` a colour bar does not change its panels' anchor: else panels with a bar would stand
 # lower than those without.
 _BAR = {"location": "bottom", "pad": 0.02, "extend": "max", "panchor": False}
@@ -43,26 +42,6 @@ def plot_frame(sequence: RgbdSequence, index: int = 0, title: str = "") -> Figur
     depth = np.ma.masked_equal(sequence.depth(index), 0)  # 0 is an unmeasured pixel
     color = (f"frame {sequence.frame_ids[index]}: colour", sequence.color(index), "")
     return plot_images([[color, ("depth", depth, DEPTH)]], title, {DEPTH: far})
-
-
-@style.styled
-def plot_views(
-    sequence: RgbdSequence, indices: Sequence[int], views: Sequence[View], title: str = ""
-) -> Figure:
-    """A row for each of some frames: measured and rendered colour and depth, and the depth error.
-
-    `indices` are those of the frames in the sequence; `views` are what the field renders from their
-    poses. Depths (m) share one colour scale. The scale of errors ends at 10 cm in every figure.
-    Unmeasured pixels are grey.
-    """
-    rows = []
-    for index, (color, rendered) in zip(indices, views, strict=True):
-        depth = np.ma.masked_equal(sequence.depth(index), 0)
-        name = f"frame {sequence.frame_ids[index]}"
-        colors = [(name, sequence.color(index), ""), ("rendered colour", color, "")]
-        depths = [("observed depth", depth, DEPTH), ("rendered depth", rendered, DEPTH)]
-        rows.append([*colors, *depths, ("|error|", 100 * np.abs(rendered - depth), DEPTH_ERROR)])
-    return plot_images(rows, title, {DEPTH_ERROR: 10.0})
 
 
 @style.styled
@@ -205,22 +184,20 @@ def plot_panels(
     x: str,
     title: str = "",
     same_x: bool = False,
-    joined: bool = True,
 ) -> Figure:
     """Tables as panels below their titles: each number is a point on x, in the row of its index.
 
     Each column is a method with its own colour and mark. All panels have the same rows, from top to
-    bottom: the texts in the tables' indices, each at most once in a table. If `joined`, a pale line
-    connects the points of a row. x is logarithmic and labelled by `x`; with `same_x` it has the
-    same range in all panels.
+    bottom: the texts in the tables' indices, each at most once in a table. A pale line connects the
+    points of a row. x is logarithmic and labelled by `x`; with `same_x` it has the same range in
+    all panels.
     """
     texts = pd.Index(np.concatenate([table.index for table in panels.values()])).unique()
     grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
     for axes, (name, values) in zip(grid, panels.items(), strict=True):
         y = texts.get_indexer(values.index)
-        if joined:
-            ends = values.min(axis=1), values.max(axis=1)
-            axes.hlines(y, *ends, color="0.85", linewidth=2, zorder=1)
+        ends = values.min(axis=1), values.max(axis=1)
+        axes.hlines(y, *ends, color="0.85", linewidth=2, zorder=1)
         for (label, color), mark in zip(style.method_colors(values).items(), _MARKS, strict=False):
             axes.plot(values[label], y, mark, color=color, mfc="none", mew=1.6, label=label)
         axes.set_yticks(range(len(texts)), texts)
