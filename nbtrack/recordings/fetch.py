@@ -2,7 +2,6 @@
 
 import contextlib
 import re
-import shutil
 import zipfile
 import zlib
 from pathlib import Path
@@ -11,10 +10,13 @@ from nbtrack.data.dataset import DATASET_SCENES, DATASET_ZIP
 from nbtrack.machinery.errors import DataError, MissingError, look_up
 from nbtrack.machinery.files import absolute, naming_damaged, write_atomic
 from nbtrack.machinery.progress import ProgressBar
-from nbtrack.recordings.formats import FORMATS
 
+# The folders of a scene from which images are read. Every scene of the dataset has both.
+_IMAGE_FOLDERS = "images", "depth_filtered"
 # The paths that are written below a scene's folder. Any other path, as with `..`, could lead out.
-_NAME = re.compile(r"(?a)[\w-]+/[\w-][\w.-]*\.(?:png|jpe?g)|[\w-][\w.-]*\.txt")
+_NAME = re.compile(
+    rf"(?a)(?:{'|'.join(_IMAGE_FOLDERS)})/[\w-][\w.-]*\.(?:png|jpe?g)|[\w-][\w.-]*\.txt"
+)
 _AGAIN = "run the same command again to go on, or name a mirror or a local ZIP file with --url"
 Files = dict[str, zipfile.ZipInfo]  # entries of the ZIP file, by paths below the scene's folder
 
@@ -25,8 +27,8 @@ def fetch_scene(name: str, folder: Path, source: str = DATASET_ZIP) -> str:
     `source` is the address of the ZIP file, from which only the scene's parts are asked for, or a
     local path. Files that are complete stay as they are, so that a killed fetch can go on.
     Raises ConfigError for an unknown name; MissingError if the ZIP file is not there, or the scene
-    is not in it; DataError if the ZIP file cannot be read, the disk has too little room, or a file
-    of other content is in the way; OSError if the disk fills up.
+    is not in it; DataError if the ZIP file cannot be read, or a file of other content is in the
+    way; OSError if the disk fills up.
     """
     look_up("scene of the dataset", name, DATASET_SCENES)
     with contextlib.ExitStack() as opened:
@@ -34,13 +36,6 @@ def fetch_scene(name: str, folder: Path, source: str = DATASET_ZIP) -> str:
             archive = opened.enter_context(_archive(source, opened))
         files = _files_of(name, archive, source)
         missing = {path: info for path, info in files.items() if _is_missing(folder / path, info)}
-        # The folder may not exist yet: its nearest parent is on the same disk.
-        existing = next(path for path in (folder, *folder.parents) if path.is_dir())
-        needed = sum(info.file_size for info in missing.values())
-        free = shutil.disk_usage(existing).free
-        if needed > free:
-            found = f"{needed / 1e6:.0f} MB are needed, and {existing} has {free / 1e6:.0f} MB free"
-            raise DataError(f"{found}: make room, or let NBTRACK_DATA name another disk")
         total, done = sum(info.compress_size for info in missing.values()), 0  # bytes
         with ProgressBar(f"fetching {name}", max(total, 1)) as bar:
             for path, info in missing.items():
@@ -86,16 +81,11 @@ def _files_of(name: str, archive: zipfile.ZipFile, source: str) -> Files:
         if _NAME.fullmatch(path):
             by_parent.setdefault(parent, {})[path] = info
     files = max(by_parent.values(), key=len, default={})
-    folder_of = {path: path.rpartition("/")[0] for path in files}  # "" for texts
-    wanted = [""]  # the texts, one folder of colour and one of depth
-    for patterns in (FORMATS["neural_rgbd"].color, FORMATS["neural_rgbd"].depth):
-        folders = [pattern.rpartition("/")[0] for pattern in patterns]
-        # The format reads the first of these folders that is there.
-        wanted += [folder for folder in folders if folder in folder_of.values()][:1]
-    if len(wanted) < 3:
+    folders = {path.rpartition("/")[0] for path in files}
+    if not folders.issuperset(_IMAGE_FOLDERS):
         found = f"{source} has no images and depth in a folder {name!r}"
         raise MissingError(f"{found}: name the dataset's own ZIP file with --url")
-    return {path: info for path, info in files.items() if folder_of[path] in wanted}
+    return files
 
 
 def _is_missing(file: Path, info: zipfile.ZipInfo) -> bool:

@@ -51,21 +51,17 @@ def write_sequence(
     # The temporary folder is a sibling, so that the final rename stays within one file system. Its
     # name begins with that of the folder, so that errors tell which one is meant; not with all of
     # it, since a name may be as long as a file system allows.
-    try:
-        with TemporaryDirectory(".unfinished", f".{folder.name[:40]}.", folder.parent) as hidden:
-            unfinished = Path(hidden) / "scene"
-            unfinished.mkdir()
-            poses = []
-            for color, depths_mm, T_world_camera in frames:
-                _write_images(unfinished, len(poses), color, depths_mm)
-                poses.append(T_world_camera)
-                progress(len(poses))
-            for name, text in {**_texts(camera, np.stack(poses)), **(notes or {})}.items():
-                (unfinished / name).write_text(text, encoding="utf-8")
-            unfinished.rename(folder)  # fails if another command has finished it meanwhile
-    except KeyboardInterrupt:
-        state = "is whole" if folder.exists() else "is not kept: the same command begins anew"
-        raise KeyboardInterrupt(f"{folder} {state}") from None
+    with TemporaryDirectory(".unfinished", f".{folder.name[:40]}.", folder.parent) as hidden:
+        unfinished = Path(hidden) / "scene"
+        unfinished.mkdir()
+        poses = []
+        for color, depths_mm, T_world_camera in frames:
+            _write_images(unfinished, len(poses), color, depths_mm)
+            poses.append(T_world_camera)
+            progress(len(poses))
+        for name, text in {**_texts(camera, np.stack(poses)), **(notes or {})}.items():
+            (unfinished / name).write_text(text, encoding="utf-8")
+        unfinished.rename(folder)  # fails if another command has finished it meanwhile
 
 
 def _write_images(
