@@ -135,6 +135,7 @@ def test_rendered_losses_by_hand() -> None:
         depth=torch.tensor([1.5, 2.0, 3.0]),
         depth_variance=torch.tensor([0.25, 0.0, 1.0], requires_grad=True),
         weights=torch.ones(3, 1),
+        depths=torch.ones(3, 1),
     )
     color = torch.tensor([[0.1, 0.3, 0.5], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     rays = replace(random_rays(3, 1.0), depth=torch.tensor([1.0, 1.9, 0.0]), color=color)

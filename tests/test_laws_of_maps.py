@@ -55,7 +55,7 @@ def test_samples_of_the_second_pass_lie_around_their_section(wall: float) -> Non
     those beside the wall have the weight of the section between them, so that the new samples lie
     evenly around its middle."""
     field = Formula(lambda points: 50 * (wall - points[:, 2]), BOX)
-    depths = field.hierarchical_depths(rays_ahead(1, 0.0), 8, 16)[0]
+    depths = field.render_hierarchically(rays_ahead(1, 0.0), 8, 16).depths[0]
     step = (3.0 - NEAR) / 8
     even = NEAR + step * (torch.arange(8) + 0.5)
     added = depths[(depths[:, None] - even).abs().amin(dim=1) > 1e-5]
@@ -117,7 +117,7 @@ def test_a_mapping_loss_is_the_sum_by_hand(name: str) -> None:
     generator.manual_seed(1)
     if name == "imap":
         rays = drawn(40)
-        seen = field.render(rays, field.hierarchical_depths(rays, 8, 4, generator))
+        seen = field.render(rays, field.render_hierarchically(rays, 8, 4, generator).depths)
         expected = rendered_losses(seen, rays, 3.0, 1.0, over_std=True)
     else:
         rays = drawn(40, tangent_planes=name == "neus_plus")

@@ -144,7 +144,7 @@ def test_hierarchical_find_the_wall(signed: bool, seeded: bool) -> None:
     field, rays = wall(signed), rays_ahead(20, torch.zeros(20))
     rays = replace(rays, origins_world=rays.origins_world.clone().requires_grad_())
     again = [torch.Generator().manual_seed(1) if seeded else None for _ in range(2)]
-    depths = field.hierarchical_depths(rays, 32, 12, again[0])
+    depths = field.render_hierarchically(rays, 32, 12, again[0]).depths
     assert depths.shape == (20, 44)
     assert not depths.requires_grad
     assert (depths.diff(dim=-1) >= 0).all()

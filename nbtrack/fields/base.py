@@ -3,7 +3,7 @@
 import abc
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -150,10 +150,11 @@ class LearnedField(Field):
         two samples (our choice; NeuS evaluates the network once more at the mid-point).
         """
         weights = self.weights(values, rays, depths)
-        if weights.shape != depths.shape:  # one weight for each section, not for each sample
-            colors = (colors[:, 1:] + colors[:, :-1]) / 2
-            depths = (depths[:, 1:] + depths[:, :-1]) / 2
-        return rendering.composite(weights, colors, depths)
+        if weights.shape == depths.shape:
+            return rendering.composite(weights, colors, depths)
+        middle_colors = (colors[:, 1:] + colors[:, :-1]) / 2
+        middles = (depths[:, 1:] + depths[:, :-1]) / 2
+        return replace(rendering.composite(weights, middle_colors, middles), depths=depths)
 
     def query_along(self, rays: Rays, depths: RaySamples) -> tuple[RayColors, RaySamples]:
         """Colour and value at z-depths (m) along rays."""
@@ -165,22 +166,23 @@ class LearnedField(Field):
         colors, values = self.query_along(rays, depths)
         return self.composite(colors, values, rays, depths)
 
-    @torch.no_grad()
-    def hierarchical_depths(
-        self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None = None
-    ) -> RaySamples:
-        """Ascending z-depths (m) of samples in two passes, the second where the first has weight.
-
-        Without a generator they are not random. Source: iMAP, Sec. 3.2 (32 and 12 samples).
-        """
-        coarse, _, _, fine = self._two_passes(rays, n_stratified, n_importance, generator)
-        return torch.cat([coarse, fine], dim=1).sort(dim=1).values
-
     def render_hierarchically(
         self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None = None
     ) -> Rendering:
-        """Volume rendering at `hierarchical_depths`, querying the field once for each sample."""
-        coarse, colors, values, fine = self._two_passes(rays, n_stratified, n_importance, generator)
+        """Volume rendering with samples in two passes, the second where the first has weight.
+
+        The field is queried once at each sample. Without a generator samples are not random.
+        Source: iMAP, Sec. 3.2 (32 and 12 samples).
+        """
+        with torch.no_grad():  # z-depths of samples are constants, even if a pose is optimised
+            far = rays_end(rays, self.bounds)
+            coarse = rendering.stratified_samples(NEAR, far, n_stratified, generator)
+        colors, values = self.query_along(rays, coarse)
+        with torch.no_grad():
+            weights = self.weights(values, rays, coarse)
+            if weights.shape != coarse.shape:  # of sections: a sample sums those on both sides
+                weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
+            fine = rendering.importance_depths(coarse, weights, n_importance, generator)
         fine_colors, fine_values = self.query_along(rays, fine)
         depths, order = torch.cat([coarse, fine], dim=1).sort(dim=1)
         all_colors = torch.cat([colors, fine_colors], dim=1).take_along_dim(order[..., None], dim=1)
@@ -210,21 +212,6 @@ class LearnedField(Field):
             parts.append(self.render_hierarchically(rays, _N_STRATIFIED, _N_IMPORTANCE))
         color = torch.cat([part.color.clamp(0, 1) for part in parts])
         return color, torch.cat([part.depth for part in parts])
-
-    def _two_passes(
-        self, rays: Rays, n_stratified: int, n_importance: int, generator: Generator | None
-    ) -> tuple[RaySamples, RayColors, RaySamples, RaySamples]:
-        """Z-depths (m) of the first pass, colours and values there, and z-depths of the second."""
-        with torch.no_grad():  # z-depths of samples are constants, even if a pose is optimised
-            far = rays_end(rays, self.bounds)
-            coarse = rendering.stratified_samples(NEAR, far, n_stratified, generator)
-        colors, values = self.query_along(rays, coarse)
-        with torch.no_grad():
-            weights = self.weights(values, rays, coarse)
-            if weights.shape != coarse.shape:  # of sections: a sample sums those on both sides
-                weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
-            fine = rendering.importance_depths(coarse, weights, n_importance, generator)
-        return coarse, colors, values, fine
 
 
 def rays_end(rays: Rays, bounds: SceneBounds) -> Values:

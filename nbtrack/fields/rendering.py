@@ -23,7 +23,8 @@ class Rendering:
     color: Float[Tensor, "rays 3"]  # in [0, 1]
     depth: Float[Tensor, "rays"]  # z-depth, m
     depth_variance: Float[Tensor, "rays"]  # m^2
-    weights: RaySamples  # the sum over a ray is at most 1
+    weights: Weights  # the sum over a ray is at most 1
+    depths: RaySamples  # z-depths (m) at which the field was asked
 
 
 def weights_from_density(
@@ -77,7 +78,7 @@ def composite(weights: RaySamples, colors: RayColors, depths: RaySamples) -> Ren
     depth = (weights * depths).sum(dim=1)
     color = (weights[..., None] * colors).sum(dim=1)
     depth_variance = (weights * (depth[:, None] - depths).square()).sum(dim=1)
-    return Rendering(color, depth, depth_variance, weights)
+    return Rendering(color, depth, depth_variance, weights, depths)
 
 
 def stratified_samples(

@@ -108,9 +108,8 @@ def _draw_samples(axes: Axes, field: LearnedField, T: Pose, point_camera: Tensor
     unused = pose.new_zeros(1, 3)  # in place of the measured colour and depth
     rays = Rays(pose[None, :3, 3], direction @ pose[:3, :3].T, unused, unused[:, 0])
     with torch.no_grad():
-        depths = field.hierarchical_depths(rays, _N_STRATIFIED, _N_IMPORTANCE)
-        rendered = field.render(rays, depths)
-    distances = depths[0] * direction.norm().item()
+        rendered = field.render_hierarchically(rays, _N_STRATIFIED, _N_IMPORTANCE)
+    distances = rendered.depths[0] * direction.norm().item()
     sizes = 12 + 400 * rendered.weights[0]  # areas in square points; all samples are visible
     label = f"{len(distances)} samples, by weight"
     axes.scatter(distances, 0 * distances, s=sizes, label=label, color=_COLORS["VR"], **_DOT)
