@@ -15,7 +15,6 @@ from itertools import product
 
 import pandas as pd
 import torch
-from basin import find_from_afar
 from motions import HAND_HELD
 
 from nbtrack import METHODS, Method, load_preset, make_tracker, open_scenes, track_scenes
@@ -56,7 +55,7 @@ def write(name: str, table: pd.DataFrame) -> None:
 
 
 def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
-    """Table III, the basin of convergence, and what each ingredient of LM adds."""
+    """Table III, the time a frame, how fast maps get right, and what each ingredient of LM adds."""
     results = track_scenes(scenes, TABLE_3, preset, RATES_3_HZ, frames=":")
     write("table_3_cells", results[_COLUMNS])
     device = device_name(choose_device())
@@ -67,7 +66,6 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     speed = track_scenes(scenes, TABLE_3, preset, [10], frames="0:", execution=Execution(workers=1))
     write("speed", speed[_COLUMNS])
     write("convergence", convergence(scenes[0], preset))
-    write("basin", find_from_afar(scenes[0], {"sdf_plus": 79, "baked": 30}, preset))
     parts = [
         track_scenes(scenes[:1], INGREDIENTS, preset, steps=30, frames=frames).assign(kept=frames)
         for frames in (":", "::8")

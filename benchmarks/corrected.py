@@ -4,7 +4,7 @@
     python benchmarks/corrected.py fast
 
 The first writes tracking.csv, times.csv, agreement.csv and odd_frames.csv to
-paper_tables/corrected, the second fast.csv and reliability.csv.
+paper_tables/corrected, the second fast.csv.
 RECORDING is a folder in the dataset's layout. The paper's methods and `agreement` are computed for
 the first one alone. Times are measured: run nothing else.
 """
@@ -53,8 +53,7 @@ SAID = [
     "frame_id", "translation_error_m", "rotation_error_deg", "fitting_ratio", "known_ratio",
     "intensity_ratio", "innovation", "position_std_m", "last_step", "p_lost",
 ]  # fmt: skip
-P_EDGES = [0, 0.01, 0.03, 0.1, 0.3, 0.5, 0.7, 0.9, 1]  # of bins of `p_lost`
-WRONG_M, WRONG_DEG = 0.05, 3.0  # a pose in a room, whose truth is known, is wrong beyond these
+WRONG_M = 0.05  # a pose in a room, whose truth is known, is wrong if its error is larger
 WRONG_IN_RECORDING_M = 0.2  # larger in a recording, whose reference poses are off, too
 
 
@@ -62,9 +61,7 @@ def main() -> None:
     """Measure and write everything."""
     torch.set_num_threads(1)
     if sys.argv[1:] == ["fast"]:
-        runs = fast()
-        write_rows("fast.csv", runs)
-        write_rows("reliability.csv", reliability(runs))
+        write_rows("fast.csv", fast())
         return
     preset = load_preset("smoke", settings=[*HAND_HELD, *IN_UNITS])
     second = with_settings(preset, "scenes.seed=1")
@@ -163,17 +160,6 @@ def fast() -> pd.DataFrame:
     methods = [method for method in ON_RECORDINGS if method != METHODS["baked"]]
     runs = [_track(rooms, methods, preset, f"::{n}", "second", elsewhere) for n in (4, 8)]
     return pd.concat(runs)
-
-
-def reliability(runs: pd.DataFrame) -> pd.DataFrame:
-    """How often LM's poses are wrong (off by more than 5 cm or 3 degrees), in bins of `p_lost`."""
-    runs = runs[runs["method"].str.startswith("NeuS+ corrected")]
-    frames = pd.concat([read_run(run).frames for run in runs["run"]])
-    limits = "translation_error_m > @WRONG_M or rotation_error_deg > @WRONG_DEG"
-    said = pd.DataFrame({"p_lost": frames["p_lost"], "wrong": frames.eval(limits)})
-    groups = said.groupby(pd.cut(frames["p_lost"], P_EDGES, include_lowest=True), observed=True)
-    table = groups.agg(frames=("wrong", "size"), wrong=("wrong", "sum"), p_lost=("p_lost", "mean"))
-    return table.reset_index(drop=True)
 
 
 def odd_frames(runs: pd.DataFrame) -> pd.DataFrame:

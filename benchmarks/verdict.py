@@ -11,12 +11,12 @@ Prints intercept and coefficients, and both kinds of mistakes at some thresholds
 import sys
 from collections.abc import Iterator
 from itertools import product
+from math import radians
 from unittest import mock
 
 import numpy as np
 import pandas as pd
 import torch
-from basin import twist
 from motions import HAND_HELD
 from scipy.optimize import minimize
 
@@ -114,14 +114,21 @@ def searched(field, sequence, cm, degrees, n_pixels, steps) -> pd.DataFrame:
     tracker = make_tracker("lm", field, np.eye(4), StepBudget(steps), settings(n_pixels))
     for number in range(len(sequence)):
         frame = sequence[number]
-        offset = twist(number, cm, degrees).double().numpy()
-        tracker.restart(retract(frame.T_world_camera, offset))
+        tracker.restart(retract(frame.T_world_camera, twist(number, cm, degrees)))
         tracker.was_lost = cm > 20
         found = tracker.track(frame)
         (off_m,), (off_deg,) = pose_errors(found.T_world_camera[None], frame.T_world_camera[None])
         told = {"translation_error_m": off_m, "rotation_error_deg": off_deg, "kind": f"{cm} cm"}
         rows.append(found.report | told)
     return pd.DataFrame(rows)
+
+
+def twist(seed: int, offset_cm: int, offset_deg: int) -> np.ndarray:
+    """A twist (omega in rad, v in m) of given lengths, in directions that the seed decides."""
+    generator = torch.Generator().manual_seed(seed)
+    directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator), dim=-1)
+    omega, v = radians(offset_deg) * directions[0], 0.01 * offset_cm * directions[1]
+    return torch.cat([omega, v]).double().numpy()
 
 
 def print_fit(rows: pd.DataFrame) -> None:
