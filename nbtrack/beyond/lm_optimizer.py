@@ -41,20 +41,18 @@ class LmOptimizer:
 
     def step(self) -> float:
         """Try one step, which is taken or refused; returns the robust cost before it."""
-        step = lm_solver.try_step(
-            self.problem, self.T_world_camera, self.terms, self.scales, self.damping, self.twist
+        now = self.problem, self.T_world_camera, self.terms, self.scales, self.damping, self.twist
+        is_better, self.T_world_camera, self.terms, self.twist, self.last_step, cost_before = (
+            lm_solver.try_step(*now)
         )
-        self.T_world_camera = step.T_world_camera
-        self.terms = step.terms
-        self.twist = step.twist
-        self.last_step = step.length
-        if step.is_better:
+        if is_better:
             self._narrow_scales()
             self.damping = max(0.2 * self.damping, 1e-9)
         else:
             self.damping *= 10
-        self.is_ended = step.length < self.problem.stage.min_step or self.damping > _MAX_DAMPING
-        return step.cost_before
+        is_short = self.last_step < self.problem.stage.min_step
+        self.is_ended = is_short or self.damping > _MAX_DAMPING
+        return cost_before
 
     def run_stage(self, max_steps: int = 60) -> None:
         """Take at most `max_steps` steps of the current stage, until it ends."""

@@ -21,7 +21,7 @@ A robust scale is a factor times the median of |r|. It is at least the field's r
 never grows.
 """
 
-from typing import NamedTuple, no_type_check
+from typing import no_type_check
 
 import numpy as np
 
@@ -36,17 +36,6 @@ PRIOR_WEIGHT = 1 / 0.5**2
 # _MIN_RATIO. Ratios above _MAX_RATIO count as _MAX_RATIO, which bounds the extrapolation.
 _MIN_RATIO = 0.5
 _MAX_RATIO = 0.9
-
-
-class Step(NamedTuple):
-    """The result of a step. If it was refused, pose, terms and twist are those before it."""
-
-    is_better: bool  # whether the step lowered the cost; otherwise it is refused
-    T_world_camera: Pose
-    terms: Terms
-    twist: np.ndarray  # 6: omega (rad) and v (m)
-    length: float  # of the tried twist: its largest component (rad or m)
-    cost_before: float
 
 
 def robust_scales(residuals: Array, before: Array, sigma: Array | tuple, factor: float) -> Array:
@@ -175,7 +164,7 @@ def damped_step(problem: Problem, T: Pose, terms: Terms, scales: Array, damping:
 @compiled
 def try_step(
     problem: Problem, T: Pose, terms: Terms, scales: Array, damping: float, last_twist: Array
-) -> Step:
+) -> tuple[bool, Pose, Terms, Array, float, float]:
     """Try a step from the pose `T`, whose terms are `terms`, and take it if it lowers the cost.
 
     `last_twist` is the step before (0 at first). If steps creep, each hardly shorter than the last
@@ -187,6 +176,10 @@ def try_step(
     it. Gradients of a grid jump from cell to cell, and reliabilities with them, although the pose
     is no worse. In the coarse stage the new reliabilities count: far from the pose, a reliable
     gradient is a sign that a surface is near.
+
+    Returns whether the step lowered the cost; the pose, the terms and the twist after it, or those
+    from before it if the cost is no lower; the largest component (rad or m) of the twist that was
+    tried; and the cost before the step.
     """
     twist = damped_step(problem, T, terms, scales, damping)
     before = robust_cost(terms.residuals, terms.reliability, scales, problem.lambda_intensity)
@@ -203,7 +196,7 @@ def try_step(
             reliability = np.where(reliability > 0, terms.reliability, ZERO)
         cost = robust_cost(after.residuals, reliability, scales, problem.lambda_intensity)
         if cost < before:
-            return Step(True, T_after, after, twist, factor * np.abs(twist).max(), before)
+            return True, T_after, after, twist, factor * np.abs(twist).max(), before
         if not does_creep:
             break
-    return Step(False, T, terms, last_twist, np.abs(twist).max(), before)
+    return False, T, terms, last_twist, np.abs(twist).max(), before
