@@ -177,7 +177,7 @@ def memory(peaks: pd.DataFrame) -> pd.DataFrame:
 def choices(runs: pd.DataFrame) -> pd.DataFrame:
     """Ratios of errors at 2 Hz: of each other choice to ours, and of VR to SDF.
 
-    Geometric means over rooms with their intervals of 95 %, as in notebook A1.
+    Geometric means over rooms with their intervals of 95 %.
     """
     runs = runs.query("rate_hz == 2").replace({"iMAP with VR": "VR", "NeuS with SDF": "SDF"})
     place = ["choice", "scene", "seed"]
