@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from unittest import mock
 
+import jaxtyping
 import pytest
 from finished import GIVEN, MAP, OWN, isolate
 
@@ -46,6 +47,12 @@ def settings_stay_inside(tmp_path: Path):
         os.environ.setdefault("NBTRACK_RUNS", str(tmp_path / "runs"))
         yield
     torch.set_num_threads(1)
+
+
+@pytest.fixture
+def unchecked(monkeypatch) -> None:
+    """Calls of the package go without checks of types, as a user's; it takes half the time."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture

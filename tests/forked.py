@@ -2,6 +2,7 @@
 
 import multiprocessing
 from contextlib import contextmanager
+from multiprocessing import forkserver
 from unittest import mock
 
 import dask
@@ -14,6 +15,7 @@ def forking():
     """The context of `multiprocessing` that starts them; workers, also Dask's, are such ones."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(IMPORTED)
+    forkserver.ensure_running()  # before Dask, which would have it import less
     with (
         dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
         mock.patch("nbtrack.experiments.workers._START", "forkserver"),

@@ -277,6 +277,7 @@ def write(folder: Path, name: str, case: Case) -> Path:
     return recordings.write_matrices(folder, case.change(seen(name)), case.settings)
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("place", range(3))
 def test_every_mistake_is_named_and_nothing_else(tmp_path: Path, place: int) -> None:
     """Catches a mistake that passes, that is taken for another one, or whose advice does not help,

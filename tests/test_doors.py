@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -152,11 +151,11 @@ REFUSED = {
 }
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_is_wrong_is_refused(case: str, monkeypatch) -> None:
+def test_what_is_wrong_is_refused(case: str) -> None:
     """Catches arguments that are taken in silence, or end in somebody else's error later on, where
     types are not checked at each call."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
     with pytest.raises(NbtrackError):
         REFUSED[case]()
 

@@ -52,8 +52,8 @@ class Square(Job):
             raise DataError("it runs beside others")
         if self.how == "deadly":
             os._exit(1)
-        # Long enough for a report, which is written after a second, to be seen a second later.
-        end = time.monotonic() + (3.0 if self.how == "slowly" else 0.0)
+        # Long enough for a report, which is written after a second, to be seen.
+        end = time.monotonic() + (2.0 if self.how == "slowly" else 0.0)
         while time.monotonic() < end:
             report(0.5, "half")
             time.sleep(0.1)
@@ -121,6 +121,7 @@ def test_a_worker_that_dies_costs_its_own_job(execution: dict) -> None:
 def test_the_bar_moves_before_a_job_ends(monkeypatch, execution: dict) -> None:
     """Catches a bar that stands still for as long as a map takes, or misses jobs elsewhere."""
     seen = []
+    monkeypatch.setattr("nbtrack.experiments.jobs._LOOK_SECONDS", 0.05)  # workers have the usual
     monkeypatch.setattr(
         "nbtrack.machinery.progress.ProgressBar.move_to",
         lambda bar, done, status="": seen.append((done, status)),
@@ -155,8 +156,10 @@ def test_a_cluster_makes_the_same_table(address: str, tmp_path: Path, undisturbe
 
 def undertake(folder: Path, workers: str) -> None:
     """The command in a process of its own, which writes checkpoints after every step."""
-    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()):
+    with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as stack:
+        stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
         patch.setattr("nbtrack.machinery.files.CHECKPOINT_SECONDS", 0.0)
+        stack.enter_context(forking() if workers != "1" else contextlib.nullcontext())
         sys.exit(tables(folder, "--workers", workers))
 
 
@@ -205,7 +208,7 @@ def test_a_handler_that_is_not_pythons(monkeypatch) -> None:
 
 # To the whole group, as a terminal does; a shell's background jobs ignore it.
 SCRIPT = """
-import glob, os, signal, sys, threading, time
+import glob, multiprocessing, os, signal, sys, threading, time
 from nbtrack.cli import main
 
 def press():
@@ -220,10 +223,11 @@ if __name__ == "__main__":
     sys.exit(main({words}))
 """
 IMPORTING = "'torch' in sys.modules", 0.1
+BEGINNING = "len(multiprocessing.active_children()) > 1", 0.3
 WORKING = "glob.glob(os.environ['NBTRACK_RUNS'] + '/locks/*')", 1.0
 
 
-@pytest.mark.parametrize("moment", [IMPORTING, WORKING])
+@pytest.mark.parametrize("moment", [IMPORTING, BEGINNING, WORKING])
 def test_interrupted(moment: tuple[str, float], tmp_path: Path, monkeypatch) -> None:
     """Catches tracebacks, also of workers, Ctrl-C that does not end a command, and processes left
     behind: then the pipe that they all write to would stay open."""

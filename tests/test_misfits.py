@@ -87,6 +87,7 @@ SILENT = {"right": lambda data: data, "saturated depth": depth(saturated)}
 SOME = ("focal length 5 % short", "images cropped", "disparity")
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("name", ["living_room", "real_room"])
 def test_each_is_told_with_its_size(tmp_path: Path, name: str) -> None:
     """Catches misfits that pass without a word, that are taken for others, and wrong sizes; of some

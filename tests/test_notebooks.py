@@ -95,8 +95,8 @@ SCENES = {"kitchen": "living_room", "whiteroom": "office"}  # what they show is 
 SIZE = 96, 72
 SETTINGS = """
     mapping.imap.iterations=200 mapping.imap.n_rays=32 network.imap.width=32
-    mapping.neus.iterations=200 mapping.neus.n_rays=32 network.neus.width=32
-    mapping.neus_plus.iterations=60 mapping.neus_plus.n_rays=32
+    mapping.neus.iterations=40 mapping.neus.n_rays=16 network.neus.width=32
+    mapping.neus_plus.iterations=20 mapping.neus_plus.n_rays=16
     mapping.neus_plus.n_surface_points=128 scenes.track_frames=20:26
     tracking.vr.n_pixels=16 tracking.sdf.n_pixels=64 tracking.lm.n_pixels=128
     tables.pixels.vr=[16] tables.pixels.sdf=[64] tables.rates_hz=[10] tables.budgets_ms=[50]
@@ -113,6 +113,7 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.filterwarnings("ignore")  # claims found in our rooms are warnings here
 @pytest.mark.parametrize("notebook", NUMBERED, ids=lambda path: path.stem)
 def test_every_cell_runs(notebook: Path, folder: Path, monkeypatch, capsys) -> None:

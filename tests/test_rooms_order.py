@@ -1,6 +1,7 @@
 """A room of the package imports only rooms before it."""
 
 import ast
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -48,3 +49,9 @@ def test_functions_are_small(path: Path) -> None:
         if isinstance(node, ast.FunctionDef):
             lines = node.end_lineno - node.lineno + 1
             assert lines <= 40, f"{node.name} has {lines} lines"
+
+
+def test_no_circle_of_imports() -> None:
+    """Catches modules of one room that import each other: which of them works then depends on which
+    is imported first."""
+    TopologicalSorter({name: imports(path) for name, path in MODULES.items()}).prepare()
