@@ -184,13 +184,14 @@ def plot_panels(
     x: str,
     title: str = "",
     same_x: bool = False,
+    limits: Mapping[str, float] | None = None,
 ) -> Figure:
     """Tables as panels below their titles: each number is a point on x, in the row of its index.
 
     Each column is a method with its own colour and mark. All panels have the same rows, from top to
     bottom: the texts in the tables' indices, each at most once in a table. A pale line connects the
     points of a row. x is logarithmic and labelled by `x`; with `same_x` it has the same range in
-    all panels.
+    all panels. `limits` are up to two values of x by their labels, as vertical lines in each panel.
     """
     texts = pd.Index(np.concatenate([table.index for table in panels.values()])).unique()
     grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
@@ -200,6 +201,9 @@ def plot_panels(
         axes.hlines(y, *ends, color="0.85", linewidth=2, zorder=1)
         for (label, color), mark in zip(style.method_colors(values).items(), _MARKS, strict=False):
             axes.plot(values[label], y, mark, color=color, mfc="none", mew=1.6, label=label)
+        looks = zip((limits or {}).items(), (style.DASHED, style.DOTTED), strict=False)
+        for (label, limit), look in looks:
+            axes.axvline(limit, **look, label=label)
         axes.set_yticks(range(len(texts)), texts)
         axes.set(title=name, xlabel=x, ylim=(len(texts) - 0.5, -0.5))
         style.log_axes(axes, "x")
