@@ -237,7 +237,10 @@ def plot_curves(
     axes.set(xlabel=x, ylabel=y)
     style.log_axes(axes, log.replace("x", "") if is_text else log)
     if table[by].is_unique and not is_text:
-        style.label_points(axes, table[x], table[y], colors)
+        axes.margins(x=0.4, y=0.1)  # room for the labels at the right of the points
+        for label, rows in groups:
+            point = rows[x].item(), rows[y].item()
+            axes.annotate(label, point, (6, -3), textcoords="offset points", color=colors[label])
     else:
         axes.figure.legend(loc="outside right center")
     return axes.figure

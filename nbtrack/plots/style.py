@@ -5,7 +5,7 @@ import io
 import textwrap
 import warnings
 from collections.abc import Iterable, Iterator
-from itertools import cycle, product
+from itertools import cycle
 from typing import Any
 
 import matplotlib.style
@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
-from matplotlib.transforms import Bbox
 from PIL import Image
 
 PALETTE = "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#a6911a"
@@ -122,31 +121,6 @@ def method_colors(labels: Iterable[str]) -> dict[str, str]:
     fixed = {label: _FIXED.get(label, _FIXED.get(label.split(",")[0])) for label in labels}
     free = cycle([color for color in PALETTE[4:] if color not in fixed.values()])
     return {label: next(free) if color is None else color for label, color in fixed.items()}
-
-
-def label_points(axes: Axes, x: Iterable, y: Iterable, colors: dict[str, str]) -> None:
-    """Draw each point's label on the right or left of the point.
-
-    `colors` maps the labels to their colours, in the order of the points. A label that would cover
-    another one, or leave the axes, is moved up or down.
-    """
-    axes.margins(x=0.4, y=0.1)
-    axes.figure.draw_without_rendering()  # gives the axes their place in the figure
-    points = sorted(zip(x, y, colors, strict=True), key=lambda point: point[1])
-    pixels = axes.transData.transform([point[:2] for point in points])
-    # Boxes that no label may cover: at first the points' marks, squares of 10 pixels.
-    taken = [Bbox.from_bounds(left - 5, bottom - 5, 10, 10) for left, bottom in pixels]
-    shifts = sorted(range(-60, 61, 3), key=abs)  # points, up
-    for x_point, y_point, label in points:
-        text = axes.annotate(label, (x_point, y_point), (0, 0), textcoords="offset points")
-        for shift, (aside, align) in product(shifts, [(6, "left"), (-6, "right")]):
-            # 3 points, half a letter's height, bring an unshifted label level with its point.
-            text.set(position=(aside, shift - 3), horizontalalignment=align, color=colors[label])
-            box = text.get_window_extent()
-            is_inside = (box.min > axes.bbox.min).all() and (box.max < axes.bbox.max).all()
-            if is_inside and not any(box.overlaps(other) for other in taken):
-                break  # if no place is free, the label stays at the last one
-        taken.append(box)
 
 
 def log_axes(axes: Axes, names: str) -> None:

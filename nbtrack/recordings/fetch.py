@@ -11,12 +11,9 @@ from nbtrack.machinery.errors import DataError, MissingError, look_up
 from nbtrack.machinery.files import absolute, naming_damaged, write_atomic
 from nbtrack.machinery.progress import ProgressBar
 
-# The folders of a scene from which images are read. Every scene of the dataset has both.
-_IMAGE_FOLDERS = "images", "depth_filtered"
-# The paths that are written below a scene's folder. Any other path, as with `..`, could lead out.
-_NAME = re.compile(
-    rf"(?a)(?:{'|'.join(_IMAGE_FOLDERS)})/[\w-][\w.-]*\.(?:png|jpe?g)|[\w-][\w.-]*\.txt"
-)
+# The paths that are written below a scene's folder: what nbtrack reads of a scene. Any other path,
+# as with `..`, could lead out of the folder.
+_NAME = re.compile(r"(?a)(?:images|depth_filtered)/[\w-][\w.-]*\.(?:png|jpe?g)|[\w-][\w.-]*\.txt")
 _AGAIN = "run the same command again to go on, or name a mirror or a local ZIP file with --url"
 Files = dict[str, zipfile.ZipInfo]  # entries of the ZIP file, by paths below the scene's folder
 
@@ -82,7 +79,7 @@ def _files_of(name: str, archive: zipfile.ZipFile, source: str) -> Files:
             by_parent.setdefault(parent, {})[path] = info
     files = max(by_parent.values(), key=len, default={})
     folders = {path.rpartition("/")[0] for path in files}
-    if not folders.issuperset(_IMAGE_FOLDERS):
+    if not {"images", "depth_filtered"} <= folders:
         found = f"{source} has no images and depth in a folder {name!r}"
         raise MissingError(f"{found}: name the dataset's own ZIP file with --url")
     return files
