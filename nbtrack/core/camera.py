@@ -27,11 +27,11 @@ class Intrinsics:
 
     def __post_init__(self) -> None:
         """Raises ConfigError for a number that no camera has. Those of numpy become Python's."""
-        for name, given in vars(self).copy().items():
-            is_size = name in ("width", "height")
-            low = 1 if is_size else 1e-3 if name in ("fx", "fy") else -1e7
-            kind = numbers.Integral if is_size else numbers.Real
-            object.__setattr__(self, name, number(f"a camera's {name}", given, low, 1e7, kind))
+        lowest = {"width": 1, "height": 1, "fx": 1e-3, "fy": 1e-3, "cx": -1e7, "cy": -1e7}
+        for name, low in lowest.items():
+            kind = numbers.Integral if name in ("width", "height") else numbers.Real
+            value = number(f"a camera's {name}", getattr(self, name), low, 1e7, kind)
+            object.__setattr__(self, name, value)
 
     @classmethod
     def from_focal(cls, width: int, height: int, focal: float) -> "Intrinsics":

@@ -102,12 +102,10 @@ def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
 
     A search would end where |d| is lowest, or where the density is highest.
     """
-    # For each column the kind of extreme that a search looks for, and its place (cm).
-    extremes = {_DISTANCE: ("lowest", curves[_DISTANCE].idxmin())}
-    extremes[_DENSITY] = "highest", curves[_DENSITY].idxmax()
     panels = new_axes(title, 2.9, 1, 2)[0]
-    for axes, name, color in zip(panels, extremes, _COLORS.values(), strict=True):
-        extreme, best_cm = extremes[name]
+    sought = {_DISTANCE: "lowest", _DENSITY: "highest"}  # what a search looks for in each curve
+    for axes, (name, extreme), color in zip(panels, sought.items(), _COLORS.values(), strict=True):
+        best_cm = curves[name].idxmin() if extreme == "lowest" else curves[name].idxmax()
         label = f"{extreme}, at {best_cm} cm"
         axes.plot(curves[name], color=color)
         axes.plot(best_cm, curves[name][best_cm], "o", color="0.3", label=label)

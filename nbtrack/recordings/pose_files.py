@@ -38,7 +38,9 @@ def in_seconds(times: Times) -> Times:
     [0.5, 0.6, nan]
     """
     usual = np.nanmedian(np.abs(times)) if np.isfinite(times).any() else 0.0
-    unit_s = next((unit for unit in (1.0, 1e-3, 1e-6, 1e-9) if usual * unit < _LATEST), 1.0)
+    units_s = np.array([1.0, 1e-3, 1e-6, 1e-9])
+    # `argmax` finds the first unit that fits. If none fits, it is 0: the unit is a second.
+    unit_s = units_s[(usual * units_s < _LATEST).argmax()]
     return np.where(np.abs(times * unit_s) < _LATEST, times * unit_s, np.nan)
 
 

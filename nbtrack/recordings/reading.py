@@ -98,10 +98,8 @@ def select_frames(recording: Recording, frames: Any, needs_poses: bool = True) -
         frame_ids = frame_ids[recording.has_pose[frame_ids]]
         found += f", and {len(frame_ids)} of these have a pose"
     if not len(frame_ids):
-        choose = "choose others (--frames of map and track, scenes.track_frames of tables)"
         add = f"add poses ({recording.pose_file or ' or '.join(recording.format.poses)})"
-        track = "or track in a map of the same place with --map-from, which needs none"
-        raise DataError(f"{found}: {choose}, {add}, {track}")
+        raise DataError(f"{found}: choose others, {add}, or track with --map-from, without poses")
     return frame_ids
 
 

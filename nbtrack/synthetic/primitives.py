@@ -24,11 +24,6 @@ def row_dot(first: Vectors, second: Vectors) -> Float[np.ndarray, "..."]:
     return np.asarray(np.einsum("...i,...i->...", first, second))
 
 
-def _row_max(rows: Vectors) -> Values:
-    """Largest entry of each row; for short rows several times as fast as `rows.max(axis=1)`."""
-    return reduce(np.maximum, rows.T)
-
-
 def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Interval:
     """The interval of ray parameters in which rays have |coordinates| <= half.
 
@@ -37,8 +32,9 @@ def _slab_interval(origins: Vectors, directions: Vectors, half: Vectors) -> Inte
     # For a ray parallel to a slab a tiny slope puts both crossings far away; 0 could give 0/0.
     direction = np.where(directions == 0.0, 1e-30, directions)
     first, second = (-half - origins) / direction, (half - origins) / direction
-    far = reduce(np.minimum, np.maximum(first, second).T)
-    return _row_max(np.minimum(first, second)), far
+    # The largest or smallest entry of each short row; `max(axis=1)` takes several times as long.
+    near = reduce(np.maximum, np.minimum(first, second).T)
+    return near, reduce(np.minimum, np.maximum(first, second).T)
 
 
 def _round_interval(offsets: Origins, directions: Points, radius: float) -> Interval:
@@ -78,7 +74,8 @@ class Solid:
         """Exact signed distance (m) outside (positive) and inside (negative)."""
         excess = self._coordinates(points) - self.half
         beyond = np.maximum(excess, 0.0)  # 0 in all coordinates of a point inside
-        return np.sqrt(row_dot(beyond, beyond)) + np.minimum(_row_max(excess), 0.0)
+        largest = reduce(np.maximum, excess.T)  # of each point; faster than `max(axis=1)`
+        return np.sqrt(row_dot(beyond, beyond)) + np.minimum(largest, 0.0)
 
     def hit(self, origins: Origins, directions: Points) -> Values:
         """Ray parameter at which a ray from outside enters the solid; inf for a miss.
