@@ -141,6 +141,20 @@ def test_curves_of_methods_and_sweeps() -> None:
     assert axes.get_yscale() == "log"
 
 
+def test_panels_share_rows_and_limits() -> None:
+    """Catches a point in another row than its text, and a panel without a limit or with another."""
+    cm = pd.DataFrame({"VR": [1.0, 30.0], "SDF": [2.0, 3.0]}, index=["a", "b"])
+    panels = {"all": cm, "second row": cm.loc[["b"]]}
+    figure = plots.plot_panels(panels, "ATE (cm)", limits={"lost": 20, "still": 60})
+    for axes, table in zip(figure.axes, panels.values(), strict=True):
+        lines = {line.get_label(): line for line in axes.lines}
+        assert [*lines] == ["VR", "SDF", "lost", "still"]
+        assert lines["VR"].get_xdata().tolist() == table["VR"].tolist()
+        assert [*lines["SDF"].get_ydata()] == [["a", "b"].index(row) for row in table.index]
+        assert [*lines["lost"].get_xdata()] == [20, 20]
+        assert lines["lost"].get_linestyle() != lines["still"].get_linestyle()
+
+
 def held(sequence, up: tuple[float, float, float]):
     """The same frames, with the cameras held upright in a world whose up is another."""
     T_world_camera, right = sequence.T_world_camera.copy(), np.roll(up, 1)
