@@ -23,7 +23,6 @@ from nbtrack.recordings.recording import Recording
 
 # RGB colour; depth maps (mm) by the name of their folder; camera-to-world pose, OpenCV camera axes.
 WrittenFrame = tuple[ColorImage, dict[str, DepthImage], Pose]
-_FRAMES_AT_ONCE = 32  # held in memory by a conversion: 50 MB at 640x480
 
 
 def write_sequence(
@@ -119,9 +118,8 @@ def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None
 
 
 def _frames(recording: Recording, numbers: Frames) -> Iterator[WrittenFrame]:
-    """The frames with these numbers one by one; at most `_FRAMES_AT_ONCE` are held in memory."""
-    for part in np.split(numbers, range(_FRAMES_AT_ONCE, len(numbers), _FRAMES_AT_ONCE)):
-        read = read_frames(recording, part, origin=np.zeros(3))
-        for color, depth, T in zip(read.colors, read.depths_mm, read.T_world_camera, strict=True):
-            yield color, {"depth": depth}, T
+    """The frames with these numbers one by one, so that memory holds no more than one."""
+    for number in numbers:
+        read = read_frames(recording, np.array([number]), origin=np.zeros(3))
+        yield read.colors[0], {"depth": read.depths_mm[0]}, read.T_world_camera[0]
         images_of(recording).forget()
