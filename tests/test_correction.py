@@ -72,10 +72,10 @@ def test_surfaces_are_mended_and_the_rest_is_left(found: CorrectedField) -> None
 def test_a_map_knows_where_it_was_measured(found: CorrectedField) -> None:
     """Catches a tracker that follows what the network made up in free space and behind walls."""
     faced = torch.tensor([[1.0, 0.1, 0.2], [0.3, -0.2, 1.2], [-1.0, 0.0, 0.0]])
-    assert (found.confidence(faced) > 0.8).all()
+    assert (found.channels(faced)[4] > 0.8).all()
     for elsewhere in (0.3 * faced, 1.2 * faced):
-        torch.testing.assert_close(found.confidence(elsewhere), torch.full((3,), 0.1))
-    assert (BakedField(found.source, VOXEL).confidence(faced) == 1).all()
+        torch.testing.assert_close(found.channels(elsewhere)[4], torch.full((3,), 0.1))
+    assert (BakedField(found.source, VOXEL).channels(faced)[4] == 1).all()
 
 
 def test_the_same_data_give_the_same(found: CorrectedField, sequence: RgbdSequence) -> None:

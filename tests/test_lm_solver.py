@@ -65,7 +65,7 @@ def test_terms_and_sums_are_the_formulas(field: BakedField, stage: Stage) -> Non
     assert 0.1 < w.mean() < 0.95
     w = w / (1 + ((g - 1) / 0.5) ** 2) ** 2
     if stage.is_fine:
-        w = w * field.confidence(torch.from_numpy(x).float()).numpy()
+        w = w * field.channels(torch.from_numpy(x).float())[4].numpy()
     else:
         w = w * ((normals @ R.T * df).sum(axis=1) / np.maximum(g, 0.3)).clip(0) ** 2
     g = np.maximum(g, 0.3)[:, None]

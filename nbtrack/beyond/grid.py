@@ -81,15 +81,14 @@ class BakedField(Field):
 
         The value is that of the sampled field: a signed distance in m, for example.
         """
-        values = self._at(points_world)
+        values = self.channels(points_world)
         return values[:3].T, values[3]
 
-    def confidence(self, points_world: Points) -> Values:
-        """How well the surface is known at points (m, world frame), in [0, 1]."""
-        return self._at(points_world)[4]
+    def channels(self, points_world: Points) -> Float[Tensor, "5 points"]:
+        """Red, green, blue, value and confidence at points (m, world frame); NaN at NaN.
 
-    def _at(self, points_world: Points) -> Float[Tensor, "5 points"]:
-        """Red, green, blue, value and confidence at points (m, world frame); NaN at NaN."""
+        The confidence says how well the surface is known, in [0, 1].
+        """
         volume = self.volume.view(5, *self.n_vertices)
         values = trilinear(volume, self.low, self.voxel, points_world)
         # `trilinear` gives NaN the values of the border.

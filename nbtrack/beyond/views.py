@@ -22,19 +22,16 @@ _COLUMNS = 20
 _ROWS = 15
 _STEP = 0.05  # of x / z and y / z from one direction to the next: a view spans 53 by 41 degrees
 _DEPTH_UNIT = 0.05  # m; a view's depths are bytes in this unit, and 0 if unknown
-_MAX_LOG_RATIO = (
-    0.3  # depths with a larger |log ratio| are of different surfaces, and count as this
-)
+_MAX_LOG_RATIO = 0.3  # depths with a larger |log ratio| are of different surfaces, and count as it
 _DEPTH_WEIGHT = 2.0  # of the dissimilarity of depths; that of luma has the weight 1
 View = UInt8[Tensor, "2 15 20"]  # luma and depth
-Views = UInt8[Tensor, "n 2 15 20"]
 
 
 class Viewpoints(NamedTuple):
     """Some of the poses that a map was made from, and the views from them."""
 
     T_world_camera: Poses
-    views: Views
+    views: UInt8[Tensor, "n 2 15 20"]
 
 
 def view_of(frame: Frame) -> View:

@@ -1,7 +1,6 @@
 """The base classes of fields, through which mapping and tracking use them; rendering losses."""
 
 import abc
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -109,7 +108,8 @@ class Field(nn.Module, abc.ABC):
     @property
     def device(self) -> torch.device:
         """The device of the field's tensors; the default device if it has none."""
-        return next(itertools.chain(self.parameters(), self.buffers()), torch.empty(0)).device
+        tensors = [*self.parameters(), *self.buffers(), torch.empty(0)]
+        return tensors[0].device
 
 
 class LearnedField(Field):

@@ -14,8 +14,6 @@ from nbtrack.machinery.settings import limited
 
 _LAYER_SIZE = 2**18  # numbers in a layer's output that a core's cache can hold: 1 MB
 
-Activation = Callable[[Tensor], Tensor]
-
 
 @dataclass(frozen=True)
 class NetworkSettings:
@@ -41,7 +39,7 @@ class FourierMlp(nn.Module):
     """
 
     def __init__(
-        self, settings: NetworkSettings, bounds: SceneBounds, act: Activation, generator: Generator
+        self, settings: NetworkSettings, bounds: SceneBounds, act: Callable, generator: Generator
     ) -> None:
         """Draw the weights with `generator`; `act` is the activation of all hidden layers."""
         super().__init__()

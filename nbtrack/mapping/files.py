@@ -66,7 +66,8 @@ def write_map(path: Path | str, finished: Map) -> None:
     path = path / MAP_FILE if path.is_dir() else path
     field, bounds = finished.field, finished.field.bounds
     # A file names its field's class, or form: only what is registered can be read again.
-    if type(field) is not (FORMS.get(field.form) if field.form else FIELDS.get(field.name)):
+    registered = FORMS.get(field.form) if field.form else FIELDS.get(field.name)
+    if type(field) is not registered:
         raise ConfigError(f"no map file holds a {type(field).__name__}: write what it comes from")
     header = {
         "format_version": _VERSION,
@@ -83,10 +84,12 @@ def write_map(path: Path | str, finished: Map) -> None:
         content = safetensors.torch.save(tensors, {_FORMAT: json.dumps(header, allow_nan=False)})
         if _map_of(content, path).key != finished.key:
             raise ValueError("it is read as another map")
-    history = finished.history.rename_axis("iteration")
-    # A folder's other files belong to its map; None removes that of an earlier map.
-    beside = {HISTORY_FILE: None if history.empty else history.to_csv().encode(), MESH_FILE: None}
-    write_together(path.parent, {**(beside if path.name == MAP_FILE else {}), path.name: content})
+    contents = {path.name: content}
+    if path.name == MAP_FILE:  # a folder's other files belong to its map; None removes old ones
+        history = finished.history.rename_axis("iteration")
+        text = None if history.empty else history.to_csv().encode()
+        contents = {HISTORY_FILE: text, MESH_FILE: None, path.name: content}
+    write_together(path.parent, contents)
 
 
 @usual_modes()

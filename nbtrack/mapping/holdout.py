@@ -25,7 +25,7 @@ def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:
     (array([0, 2, 3, 5]), array([1, 4]))
     """
     indices = np.arange(n_frames)
-    held_out = indices[:0] if every < 2 or n_frames < every else indices[every // 2 :: every]
+    held_out = indices[every // 2 :: every] if 2 <= every <= n_frames else indices[:0]
     return np.setdiff1d(indices, held_out), held_out
 
 

@@ -16,12 +16,11 @@ def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
     since hands start and stop within a frame. Raises ConfigError, with the most similar name, for
     any other model.
     """
-    last = estimates[-1]
-    starts = {"previous_pose": [last], "constant_velocity": [last], "better_of_both": [last]}
-    if len(estimates) > 1:  # else no velocity is known
-        moved_on = last @ np.linalg.inv(estimates[-2]) @ last
-        starts |= {"constant_velocity": [moved_on], "better_of_both": [moved_on, last]}
-    return look_up("motion model", motion_model, starts)
+    last, one_before = estimates[-1], estimates[-2:-1]  # without a pose before no velocity is known
+    moved_on = [last @ np.linalg.inv(T) @ last for T in one_before]
+    models = {"previous_pose": [last], "better_of_both": [*moved_on, last]}
+    models["constant_velocity"] = moved_on or [last]
+    return look_up("motion model", motion_model, models)
 
 
 def rigid(T: Pose | Poses) -> Pose | Poses:

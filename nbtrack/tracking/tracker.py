@@ -199,8 +199,7 @@ class Tracker(abc.ABC):
         arguments = self.field, self.estimates[-1], self.budget, self.settings
         return type(self), arguments, self.state()
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.restore(state)
+    __setstate__ = restore
 
     def _warm_up(self, frame: Frame, T_starts: Poses) -> None:
         """Take some steps that do not count, since the first ones load, allocate and record.
