@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
-import pandas as pd
 
 _SPECIAL = {character: rf"\{character}" for character in "_&%$#{}"}
 _SPECIAL |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -14,8 +13,6 @@ _SPECIAL |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\texta
 _AS_IS = r"\$[^$]+\$|\\(?:\w*ref|cite\w*)\*?\{[^}]*\}|\\[a-zA-Z]+|\\[^a-zA-Z\s]"
 # Group 1 is what stays. Without it, the match is a special character, to be escaped.
 _AUTHORS = re.compile(rf"({_AS_IS})|[%&#_^$\\]")
-_COLUMN_PT = 235  # width of a text column of a paper on letter paper or A4
-_CHARACTER_PT, _GAP_PT = 4, 12  # width of a \scriptsize character, and between two table columns
 _KINDS = {"table_1": "ate", "table_2": "runtime", "table_3": "beyond"}  # by a file's stem
 _LATEX = jinja2.Environment(
     loader=jinja2.PackageLoader("nbtrack", ""), keep_trailing_newline=True, trim_blocks=True,
@@ -47,7 +44,6 @@ def latex_file(styler: Any, path: Path, note: str, wording: Wording = OUR_WORDIN
     the usual caption without the note.
     """
     cells = styler.data
-    columns = [wording.scenes.get(scene, scene) for scene in cells]
     # Rows by rate, each with its method; in Table II by tracker, each with its n.
     groups = {}
     for (first, second), row in zip(cells.index, cells.to_numpy(), strict=True):
@@ -62,19 +58,9 @@ def latex_file(styler: Any, path: Path, note: str, wording: Wording = OUR_WORDIN
         has_steps="n_pixels" in cells.index.names,
         has_std=any(cell.std for cell in cells.to_numpy().flat),
         has_converged=any("‡" in cell.value for cell in cells.to_numpy().flat),
-        columns=columns,
-        is_wide=_width_pt(cells, columns) > _COLUMN_PT,
+        columns=[wording.scenes.get(scene, scene) for scene in cells],
         groups=groups.items(),
     )
-
-
-def _width_pt(cells: pd.DataFrame, columns: list[Any]) -> float:
-    """About the width (pt) of a printed table: of its rates, its methods and its other columns."""
-    n_characters = 8 + max(len(str(second)) for _, second in cells.index)
-    for name, column in zip(columns, cells, strict=True):
-        words = str(name).replace("_", " ").split()  # printed one below the other
-        n_characters += max(map(len, [*words, *map(str, cells[column])]))
-    return _CHARACTER_PT * n_characters + _GAP_PT * (len(columns) + 1)
 
 
 def _plain(text: object) -> str:

@@ -53,9 +53,8 @@ def _code_of(kind: type) -> list[str]:
     They are the installed distributions of the class and of its bases, as names with versions. A
     class that is from no distribution, and not from this package, adds its name and version.
     """
-    installed = {base.__module__: _installed(base.__module__) for base in kind.__mro__}
-    distributions = sorted({name for names in installed.values() for name in names})
-    if installed[kind.__module__] or kind.__module__.startswith("nbtrack."):
+    distributions = sorted({name for base in kind.__mro__ for name in _installed(base.__module__)})
+    if kind.__module__.startswith("nbtrack.") or _installed(kind.__module__):
         return distributions
     name, version = f"{kind.__module__}.{kind.__qualname__}", vars(kind).get("version")
     if version is None:

@@ -130,25 +130,24 @@ def _summary(metrics: dict[str, Any]) -> Iterator[str]:
         yield f"lost   {share:.1%} of the frames, off by more than {LOST_THRESHOLD_M:g} m"
     else:
         yield "error  no true pose is known of the tracked frames: errors cannot be computed"
-    # A count of None gives no line. What the tracker says is a line even if it is 0.
-    counts = {
-        "of the frames lost, as the tracker itself says": metrics.get("flagged_frames"),
-        "of the frames without a true pose, in no error": n_unknown or None,
-        "of the frames without any depth, not searched": metrics["frames_without_depth"] or None,
-    }
-    for what, count in counts.items():
-        if count is not None:
-            yield f"       {count / n_frames:.1%} {what}"
+    if "flagged_frames" in metrics:
+        flagged = metrics["flagged_frames"] / n_frames
+        yield f"       {flagged:.1%} of the frames lost, as the tracker itself says"
+    if n_unknown:
+        yield f"       {n_unknown / n_frames:.1%} of the frames without a true pose, in no error"
+    if n_empty := metrics["frames_without_depth"]:
+        yield f"       {n_empty / n_frames:.1%} of the frames without any depth, not searched"
     work = f"{metrics['steps_per_frame']:.1f} steps and {1e3 * metrics['seconds_per_frame']:.0f} ms"
     yield f"work   {work} a frame (budget: {metrics['budget']}) on {metrics['device']}"
 
 
 def _warn(metrics: dict[str, Any]) -> None:
     """Print warnings if the errors of a run cannot be trusted."""
+    if metrics["map_warning"]:
+        tell(f"nbtrack: warning: {metrics['map_warning']}")
     outside = metrics.get("outside_map_share", 0.0)
-    unseen = f"{outside:.0%} of the frames saw little of what was mapped" if outside > 0 else None
-    for warning in filter(None, (metrics["map_warning"], unseen)):
-        tell(f"nbtrack: warning: {warning}")
+    if outside > 0:
+        tell(f"nbtrack: warning: {outside:.0%} of the frames saw little of what was mapped")
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:

@@ -166,18 +166,12 @@ class MapJob(Job):
 
 
 def map_unit(job: MapJob) -> float:
-    """Metres in a unit of a job's map; an estimate if the map is still to be made."""
+    """Metres in a unit of a job's map; if it is still to be made, an estimate from a few frames."""
     if job.is_done:
-        return job.map().field.bounds.metres_per_unit
-    return _rough_unit(job.scene, job.frames)
-
-
-@lru_cache
-def _rough_unit(scene: Scene, frames: str) -> float:
-    """Metres in a unit of a map of some frames of a scene, estimated from a few of them."""
-    ids = scene.select(frames)
+        return _stored(job.folder).field.bounds.metres_per_unit
+    ids = job.scene.select(job.frames)
     places = np.linspace(0, len(ids) - 1, min(len(ids), _FRAMES_LOOKED_AT)).astype(int)
-    return observed_bounds(read_frames(scene.recording, ids[places])).metres_per_unit
+    return observed_bounds(read_frames(job.scene.recording, ids[places])).metres_per_unit
 
 
 def _stored(path: Path) -> Map:

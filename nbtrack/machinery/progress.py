@@ -68,7 +68,7 @@ class ProgressBar(tqdm):
     It is used in a `with` block with `move_to`, or as an iterator over a collection.
     """
 
-    def __init__(self, title: str, work: float | Collection, is_shown: bool = True) -> None:
+    def __init__(self, title: str, work: float | Collection) -> None:
         """Begin a bar over a collection, or over an amount of work in any unit.
 
         Nothing is shown in the first second.
@@ -79,7 +79,7 @@ class ProgressBar(tqdm):
         elif not sys.stderr.isatty():
             options |= {"file": _Line(), "mininterval": _LINE_SECONDS, "bar_format": _LINE_FORMAT}
         # With "miniters" 0 only the time decides when to show; without "ascii" bars are of blocks.
-        options |= {"disable": not is_shown, "delay": _DELAY_SECONDS, "miniters": 0, "ascii": False}
+        options |= {"delay": _DELAY_SECONDS, "miniters": 0, "ascii": False}
         work_of = "iterable" if isinstance(work, Collection) else "total"
         super().__init__(desc=title, **{work_of: work}, **options)
 
