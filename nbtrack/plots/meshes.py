@@ -5,6 +5,7 @@ import torch
 import trimesh
 from jaxtyping import Bool, Float
 from skimage.measure import marching_cubes
+from trimesh.visual.color import srgb_to_linear
 
 from nbtrack.beyond.points import PointCloud, min_depth_behind
 from nbtrack.core.arrays import Colors, Frames, Points, Position, Values
@@ -112,9 +113,7 @@ def _glb_bytes(mesh: Mesh, origin: Position, up: Position) -> bytes:
     T_file_mesh[:3, :3] = horizontal, up, np.cross(horizontal, up)
     T_file_mesh[:3, 3] = T_file_mesh[:3, :3] @ origin
     colors = np.array(mesh.visual.vertex_colors)
-    srgb = colors[:, :3] / 255
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    colors[:, :3] = (255 * linear).round()  # IEC 61966-2-1
+    colors[:, :3] = (255 * srgb_to_linear(colors[:, :3])).round()
     mesh = mesh.copy()
     mesh.visual.vertex_colors = colors
     scene = trimesh.Scene()
