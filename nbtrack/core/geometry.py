@@ -6,14 +6,6 @@ from torch import Tensor
 
 from nbtrack.machinery.device import constant
 
-# The matrix [v]×, for which [v]× x = v × x, is linear in v. Each row holds the nine entries
-# (row-major) that one component of v is multiplied by.
-_CROSS = (
-    (0, 0, 0, 0, 0, -1, 0, 1, 0),
-    (0, 0, 1, 0, 0, 0, -1, 0, 0),
-    (0, -1, 0, 1, 0, 0, 0, 0, 0),
-)
-
 
 def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
     """The quaternion divided by its norm, which describes the same rotation.
@@ -26,6 +18,7 @@ def normalize_quaternion(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
 def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrix of a quaternion (order w, x, y, z): R = I + 2 [v]× (w I + [v]×).
 
+    [v]× is the matrix for which [v]× x = v × x, where v holds x, y and z of the quaternion.
     The quaternion is normalised here, so that its gradient is tangential to the unit sphere. A
     radial part could dominate Adam's step, and the renormalisation after the step would undo it.
 
@@ -35,7 +28,8 @@ def quaternion_to_matrix(q_wxyz: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*b
     device, dtype = q_wxyz.device, q_wxyz.dtype
     w, v = normalize_quaternion(q_wxyz).split([1, 3], dim=-1)
     identity = constant(((1, 0, 0), (0, 1, 0), (0, 0, 1)), device, dtype)
-    cross = (v[..., None] * constant(_CROSS, device, dtype)).sum(-2).unflatten(-1, (3, 3))  # [v]×
+    # The rows of [v]× are e × v for the axes e, which are the rows of the identity.
+    cross = torch.linalg.cross(identity.expand(*v.shape[:-1], 3, 3), v[..., None, :])
     w_identity_plus_cross = torch.addcmul(cross, w[..., None], identity)
     return torch.add(identity, cross @ w_identity_plus_cross, alpha=2)
 
