@@ -179,34 +179,41 @@ def _views(sequence: RgbdSequence, frames: Frames) -> State:
 def _measured_planes(
     sequence: RgbdSequence, frames: Frames, grid: BakedField
 ) -> tuple[np.ndarray, ...]:
-    """Random measured points whose tangent plane is known; DataError if there is none.
+    """Random measured points whose tangent plane is known, ordered by the grid's cells.
 
     Returns points (n x 3, m, world), their planes' normals (n x 3), z-depths (n, m) and colours
-    (n x 3, in [0, 1]), ordered by the grid's cells: vertices that neighbours share are then still
-    in the processor's cache.
+    (n x 3, in [0, 1]). The order keeps vertices that neighbours share in the processor's cache.
 
     The points come from `_N_POINTS` random pixels. If fewer than `_POINTS_A_CELL` of them lie in a
     cell on average, as in a large scene, all are drawn anew from more pixels, at most `_MAX_TIMES`
     as many.
     """
-    sampler, mapped = PixelSampler(sequence, torch.device("cpu")), torch.from_numpy(frames)
-    times = 1.0
-    for _ in range(2):
-        generator = torch.Generator().manual_seed(0)
-        rays = sampler.draw(round(times * _N_POINTS), generator, mapped, tangent_planes=True)
-        ends = rays.points(rays.depth[:, None])[:, 0]
-        low, high = grid.low, grid.low + grid.voxel * (ends.new_tensor(grid.n_vertices) - 1)
-        # The grid has no values for points outside, such as a facade seen through a window.
-        is_inside = ((ends >= low) & (ends <= high)).all(dim=1)
-        has_plane = rays.normals_world.any(dim=1) & is_inside
-        if not has_plane.any():
-            found = f"{sequence.name} shows no surface to correct a map by"
-            raise DataError(f"{found}: check its depth")
-        vertices, _ = interpolation(ends[has_plane].double().numpy(), grid)
-        cells = vertices[:, 0]  # the number of a cell is that of its lowest vertex
-        times = min(_POINTS_A_CELL * len(np.unique(cells)) / len(cells), _MAX_TIMES)
-        if times <= 1:
-            break
+    planes, cells = _drawn_planes(sequence, frames, grid, _N_POINTS)
+    times = min(_POINTS_A_CELL * len(np.unique(cells)) / len(cells), _MAX_TIMES)
+    if times > 1:
+        planes, cells = _drawn_planes(sequence, frames, grid, round(times * _N_POINTS))
     order = np.argsort(cells, kind="stable")
+    return tuple(part[order] for part in planes)
+
+
+def _drawn_planes(
+    sequence: RgbdSequence, frames: Frames, grid: BakedField, n_pixels: int
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """The four arrays of `_measured_planes` from `n_pixels` random pixels, and the points' cells.
+
+    Pixels without a known tangent plane are left out. DataError if there is no other.
+    """
+    sampler, generator = PixelSampler(sequence, torch.device("cpu")), torch.Generator()
+    mapped = torch.from_numpy(frames)
+    rays = sampler.draw(n_pixels, generator.manual_seed(0), mapped, tangent_planes=True)
+    ends = rays.points(rays.depth[:, None])[:, 0]
+    low, high = grid.low, grid.low + grid.voxel * (ends.new_tensor(grid.n_vertices) - 1)
+    # The grid has no values for points outside, such as a facade seen through a window.
+    is_inside = ((ends >= low) & (ends <= high)).all(dim=1)
+    has_plane = rays.normals_world.any(dim=1) & is_inside
+    if not has_plane.any():
+        raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")
     drawn = ends, rays.normals_world, rays.depth, rays.color
-    return tuple(each[has_plane].double().numpy()[order] for each in drawn)
+    planes = [part[has_plane].double().numpy() for part in drawn]
+    vertices, _ = interpolation(planes[0], grid)
+    return planes, vertices[:, 0]  # the number of a cell is that of its lowest vertex

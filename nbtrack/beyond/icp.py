@@ -106,8 +106,10 @@ class IcpTracker(Tracker):
         if np.abs(self.T_starts - self.T_starts[0]).max() < _FAR_APART:
             starts = starts[:1]
         # The start with the most inliers in the wide alignment is aligned again, narrowly.
-        coarse = max([self._align(T, _WIDE) for T in starts], key=lambda result: result.num_inliers)
-        found = self._align(coarse.T_target_source, _NARROW) if coarse.num_inliers else coarse
+        results = [self._align(T, _WIDE) for T in starts]
+        found = max(results, key=lambda result: result.num_inliers)
+        if found.num_inliers:
+            found = self._align(found.T_target_source, _NARROW)
         if not found.num_inliers or not np.isfinite(found.T_target_source).all():
             return float("nan")
         self.T_world_camera = torch.from_numpy(found.T_target_source)

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 
 import numpy as np
 import torch
@@ -110,15 +111,14 @@ class LmTracker(Tracker):
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Draw the frame's points, and begin the descent at the start that fits them best."""
-        starts = T_starts.double().numpy()
+        n_expected, starts = len(T_starts), T_starts.double().numpy()
         if self.was_lost and self.last_good is not None:
             starts = np.concatenate([starts, self.last_good.numpy()[None]])
         starts = rigid(starts)
-        expected, last_good = np.split(starts, [len(T_starts)])  # `last_good` is one pose or none
         # Poses near which the camera should be: `innovation` is the distance from them. The motion
         # model's starts mean little after a lost frame. Then it is the last good pose, if any.
-        self.trusted = last_good if self.was_lost else expected
-        self.T_start = expected[0]
+        self.trusted = starts[n_expected:] if self.was_lost else starts[:n_expected]
+        self.T_start = starts[0]
         self.best = None
         self.remaining_steps = iter(())  # no steps, if the frame has too few points
         observed = draw_points(frame, self.settings.n_pixels, self.generator)
@@ -140,7 +140,7 @@ class LmTracker(Tracker):
         self.best, *_ = _by_cost(descents)
         # The last one of the motion model's starts is the previous pose, unless the model is
         # constant velocity alone.
-        self.remaining_steps = self._steps(frame, expected[-1])
+        self.remaining_steps = self._steps(frame, T_expected=starts[n_expected - 1])
 
     def step(self) -> float:
         """One step of Levenberg-Marquardt, or one descent elsewhere; returns the cost before it."""
@@ -218,9 +218,12 @@ class LmTracker(Tracker):
         anchor = T_expected if self.last_good is None else self.last_good.numpy()
         if self.field.viewpoints is None:
             # The anchor, and then the anchor turned about x, y and z both ways, by growing angles.
-            angles = [factor * 0.2 for factor in range(1, self.settings.n_restarts)]  # rad
-            axes = [sign * axis for axis in np.eye(6)[:3] for sign in (1, -1)]
-            starts = [anchor] + [retract(anchor, a * axis) for a in angles for axis in axes]
+            angles = 0.2 * np.arange(1, self.settings.n_restarts)  # rad
+            turns = product(angles, np.eye(6)[:3], (1, -1))
+            starts = [
+                anchor,
+                *(retract(anchor, angle * axis * sign) for angle, axis, sign in turns),
+            ]
         else:
             starts = self._starts_by_views(frame, anchor, self.field.viewpoints)
         return starts[: self.settings.n_restarts] if len(self.trusted) else starts

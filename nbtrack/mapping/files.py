@@ -47,9 +47,9 @@ class Map:
     @property
     def key(self) -> str:
         """A hash of the field, its bounds and its weights, as twelve hexadecimal digits."""
-        field = self.field
-        plain = [field.name, field.form, self.record["network"], asdict(field.bounds)]
-        return digest_of(plain, _tensors(field))[:12]
+        mapped = self.field
+        plain = [mapped.name, mapped.form, self.record["network"], asdict(mapped.bounds)]
+        return digest_of(plain, _tensors(mapped))[:12]
 
 
 @typed
