@@ -152,11 +152,9 @@ def _waves(jobs: Sequence[Job]) -> list[dict[Path, Job]]:
     if not jobs:
         raise ConfigError("nothing to do: give at least one scene, field or method, rate and seed")
     waves = []
-    wave = {job.folder: job for job in jobs if not job.is_done}
-    while wave:
-        waves.insert(0, wave)
-        needed = [job.needs for job in wave.values()]
-        wave = {job.folder: job for job in needed if job and not job.is_done}
+    while missing := {job.folder: job for job in jobs if not job.is_done}:
+        waves.insert(0, missing)
+        jobs = [job.needs for job in missing.values() if job.needs]
     return waves
 
 
@@ -165,15 +163,12 @@ def _workplace(execution: Execution, n_jobs: int) -> AbstractContextManager[Work
 
     It is None if jobs run in this process, one after the other.
     """
-    if execution.dask is not None:
-        images_of.cache_clear()  # as below: workers may be on this machine
-        return cluster(execution.dask, n_jobs)
     usual = device.usable_cores() if device.choose_device().type == "cpu" else 1
     workers = min(execution.workers or usual, n_jobs)
-    if workers <= 1:
+    if workers <= 1 and execution.dask is None:
         return nullcontext()
     images_of.cache_clear()  # images that this process has read take memory that workers need
-    return processes(workers)
+    return processes(workers) if execution.dask is None else cluster(execution.dask, n_jobs)
 
 
 def _caught(work: Callable, *arguments: Any) -> Any:

@@ -90,15 +90,7 @@ class Preset:
 
         Raises ConfigError for an unknown key, or a value of the wrong type or range.
         """
-        tree = PRESETS[self.name].settings
-        for key in values:
-            part, *names = key.split(".")
-            known = tree.get(part)
-            if names and isinstance(known, dict):
-                # An unknown field or tracker gets its own message. The check of the whole key below
-                # could suggest a key of a field or tracker that is not meant.
-                look_up(f"config key, {part} of", names[0], known)
-        checked = flat(with_values(tree, values))
+        checked = flat(with_values(PRESETS[self.name].settings, values))
         return replace(self, chosen=self.chosen | {key: checked[key] for key in values})
 
     def with_method(self, settings: Sequence[str]) -> "Preset":
