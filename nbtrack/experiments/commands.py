@@ -82,15 +82,44 @@ def _write_mesh(job: MapJob, finished: Map) -> None:
 
 def track_command(options: Namespace) -> None:
     """Track a sequence in a map that is given, or in its own, which is made if it is missing."""
-    given = MapJob.of_given(options.map_from) if options.map_from else None
-    # The field is that of a given map, unless the user names another one.
-    field = given.field if given and not (options.field or options.method) else options.field
+    run = _asked_run(options)
+    for warning in reach_warnings([run]):
+        tell(f"nbtrack: warning: {warning}")
+    runs.prepare(options.out)
+    if not run.needs.given:
+        _make_map(run.needs)
+    # A finished run is made again: its files name the recording and the map, which may lie
+    # elsewhere now, and the seconds that it took.
+    (run.folder / runs.METRICS_FILE).unlink(missing_ok=True)
+    (metrics,) = run_jobs([run])
+    draw_overview(run)
+    folder = runs.deliver(run.folder, runs.FILES_OF_RUN, options.out)
+    label = run.needs.map().field.label
+    print(f"{run.scene.name}: {run.tracker} in {label}, {metrics['frames']} frames")
+    for line in _summary(metrics):
+        print(f"  {line}")
+    print(f"  files  {folder}: trajectory.txt (TUM), overview.png, metrics.json with all numbers")
+    print(f"  next   nbtrack export {shlex.quote(str(absolute(folder)))} --to gif tracking.gif")
+    _warn(metrics)
+
+
+def _asked_run(options: Namespace) -> TrackJob:
+    """The run that the options of `track` ask for. A synthetic room that is missing is made.
+
+    Raises ConfigError, DataError or MissingError, before a map is made, if the run cannot begin.
+    """
+    given, field = None, options.field
+    if options.map_from:
+        given = MapJob.of_given(options.map_from)
+        if not options.method:  # a method names a field
+            field = field or given.field
     method = method_of(options.method, field, options.tracker)
     preset = load_preset(options.preset, options.config, options.settings, method.settings)
     if given:
         _check_fits(given, method.field, preset, options)
-    has_budget = options.steps is not None or options.rate is not None
-    steps = options.steps if has_budget else method.usual_steps
+    steps = options.steps
+    if steps is None and options.rate is None:
+        steps = method.usual_steps
     make_budget(steps, options.rate)  # raises for a wrong one, before a room is made
     scene = _opened(options, preset)
     job = given or MapJob.of(scene, method.field, preset, options.map_frames or ":", options.seed)
@@ -101,23 +130,7 @@ def track_command(options: Namespace) -> None:
         options.frames, options.seed, options.start,
     )  # fmt: skip
     run.check()
-    for warning in reach_warnings([run]):
-        tell(f"nbtrack: warning: {warning}")
-    runs.prepare(options.out)
-    if not given:
-        _make_map(job)
-    # A finished run is made again: its files name the recording and the map, which may lie
-    # elsewhere now, and the seconds that it took.
-    (run.folder / runs.METRICS_FILE).unlink(missing_ok=True)
-    (metrics,) = run_jobs([run])
-    draw_overview(run)
-    folder = runs.deliver(run.folder, runs.FILES_OF_RUN, options.out)
-    print(f"{scene.name}: {method.tracker} in {job.map().field.label}, {metrics['frames']} frames")
-    for line in _summary(metrics):
-        print(f"  {line}")
-    print(f"  files  {folder}: trajectory.txt (TUM), overview.png, metrics.json with all numbers")
-    print(f"  next   nbtrack export {shlex.quote(str(absolute(folder)))} --to gif tracking.gif")
-    _warn(metrics)
+    return run
 
 
 def _summary(metrics: dict[str, Any]) -> Iterator[str]:

@@ -161,9 +161,10 @@ class TrackJob(Job):
         notes["device"] = device_name(tracker.device)  # the CPU for LM and ICP
         if warning == _OTHER_WORLD:  # moves the true poses into the map's world, for the errors
             tracked, is_explained = in_world_of_map(tracked)
-            # The first frame alone may be off, as where the map does not reach; NaN fits nothing.
-            fits = tracked.frames["translation_error_m"].median() <= LOST_THRESHOLD_M
-            notes["map_warning"] = warning if is_explained else None if fits else _UNEXPLAINED
+            if not is_explained:
+                # The first frame alone may be off, as where the map ends. NaN fits nothing.
+                fits = tracked.frames["translation_error_m"].median() <= LOST_THRESHOLD_M
+                notes["map_warning"] = None if fits else _UNEXPLAINED
         metrics = scores_of(tracked) | self._provenance(finished) | notes
         write_run(self.folder, replace(tracked, metrics=metrics))
         checkpoint.unlink(missing_ok=True)
