@@ -2,7 +2,7 @@
 
 And texts of every format with anything in them, of which some that can be read are also checked:
 absurd numbers must not break the check either. `NBTRACK_FUZZ_EXAMPLES` sets how many are tried
-(default 100).
+(default 300).
 """
 
 import json
@@ -14,13 +14,12 @@ import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from random import Random
 
 import cv2
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from recordings import N_FRAMES, WRITERS, change_camera, source, write_recording
 
 from nbtrack.checks.check import check_recording
@@ -137,12 +136,13 @@ def test_files_of_the_system(tmp_path: Path) -> None:
     assert len(open_recording(folder)) == N_FRAMES
 
 
-EXAMPLES = int(os.environ.get("NBTRACK_FUZZ_EXAMPLES", "100"))
+EXAMPLES = int(os.environ.get("NBTRACK_FUZZ_EXAMPLES", "300"))
 WORDS = (
     "nan", "inf", "-inf", "1e400", "-1e308", "1e200", "1e7", "-0.5", "[" * 100_000,
     "1e-320", "0", "-0", "1", "1_0", "0x1p3", "٣", "½", "true", "null", "NaN", "1" * 400,
     "a" * 5000, "\0", "#", ",", '"', "{", "=", "..", "/", "rgb", "\ufeff", "\u2028", "wxyz",
-    "plain", "depth_scale", "[x]", "-5", "1e9", "[]", '"ray"', '"up up up"', '"tum"', "1979-05-27",
+    "plain", "depth_scale", "[x]", "", "\n", "\r", "\ud800", "-5", "1e9", "[]",
+    '"ray"', '"up up up"', '"tum"', "1979-05-27",
 )  # fmt: skip
 DECLARED = 'format = "plain"\ndepth_scale = 1000\nno_depth = 65535\ndepth_along = "axis"\n'
 DECLARED += 'camera_axes = "right up forward"\nposes = "world-to-camera"\nquaternion = "wxyz"\n'
@@ -157,51 +157,34 @@ def small_recording(format: str, base: Path) -> tuple[Path, list[Path]]:
     return folder, [*sorted(texts), folder / "metadata", folder / "sequence.toml"]
 
 
-@st.composite
-def nearly_as(draw: Callable, original: bytes) -> bytes:
-    """A text that is nearly right: words replaced, lines dropped, doubled, cut or joined."""
-    lines = original.decode().splitlines()
-    for _ in range(draw(st.integers(1, 4)) if lines else 0):
-        number = draw(st.integers(0, len(lines) - 1))
-        line = lines[number]
-        # Mostly a number: what surrounds it decides little.
-        spans = [match.span() for match in re.finditer(r"-?[\d.e+-]+|\S+", line)]
-        start, stop = draw(st.sampled_from(spans or [(0, 0)]))
-        any_word = st.sampled_from(WORDS)
-        word = draw(any_word | any_word | any_word | st.text(max_size=8) | st.floats().map(str))
-        replaced, cut = [line[:start] + word + line[stop:]], [line[:start]]
-        others = ([], [line, line], cut, [f"{line} {lines[0]}"])
-        lines[number : number + 1] = draw(st.sampled_from((replaced,) * 6 + others))
-        lines = lines or [""]
-    end = draw(st.sampled_from(("\n", "\r\n", "\r", "\n\n")))
-    return end.join(lines).encode("utf-8", "surrogatepass")
+def nearly_as(original: str, random: Random) -> str:
+    """A text that is nearly right: of its words, blanks and numbers some are replaced."""
+    parts = re.split(r"(-?[\d.e+-]+|\s+)", original)
+    for _ in range(random.randint(1, 4)):
+        parts[random.randrange(len(parts))] = random.choice(WORDS)
+    return "".join(parts)
 
 
-@settings(
-    max_examples=EXAMPLES, deadline=None, derandomize=EXAMPLES <= 100, database=None,
-    suppress_health_check=list(HealthCheck),
-)  # fmt: skip
-@given(data=st.data())
-def test_only_our_own_errors(tmp_path_factory, data) -> None:
+def test_only_our_own_errors(tmp_path: Path) -> None:
     """Catches any other exception or warning, and poses or pixels that are no numbers."""
-    format = data.draw(st.sampled_from([*WRITERS]))
-    folder, texts = small_recording(format, tmp_path_factory.getbasetemp() / "fuzz")
-    path = data.draw(st.sampled_from(texts))
-    original = path.read_bytes() if path.is_file() else None
-    anything = st.binary(max_size=200), st.text(max_size=200).map(str.encode)
-    nearly = nearly_as(original or (DECLARED if path.suffix == ".toml" else "1 2 3 4").encode())
-    path.write_bytes(data.draw(st.one_of(*anything, nearly, nearly, nearly)))
-    message = "nothing wrong"
-    try:
-        sequence = read_sequence(folder, slice(0, 1), format=format)
-        assert np.isfinite(sequence.T_world_camera).all()
-        assert np.isfinite([sequence.intrinsics.fx, sequence.intrinsics.cx]).all()
-        if data.draw(st.integers(0, 19)) == 0:
-            str(check_recording(open_recording(folder, format)))
-    except NbtrackError as error:
-        message = str(error)
-    finally:
+    random = Random(0)
+    for number in range(EXAMPLES):
+        format = random.choice([*WRITERS])
+        folder, texts = small_recording(format, tmp_path)
+        path = random.choice(texts)
+        original = path.read_text() if path.is_file() else None
+        text = nearly_as(original or DECLARED, random)
+        path.write_text(text, "utf-8", "surrogatepass")
+        message = "nothing wrong"
+        try:
+            sequence = read_sequence(folder, slice(0, 1), format=format)
+            assert np.isfinite(sequence.T_world_camera).all()
+            assert np.isfinite([sequence.intrinsics.fx, sequence.intrinsics.cx]).all()
+            if number % 20 == 0:
+                str(check_recording(open_recording(folder, format)))
+        except NbtrackError as error:
+            message = str(error)
         path.unlink()
         if original is not None:
-            path.write_bytes(original)
-    assert 0 < len(message) < 1000
+            path.write_text(original)
+        assert 0 < len(message) < 1000, (path, text)

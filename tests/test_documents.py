@@ -14,7 +14,6 @@ from types import SimpleNamespace
 from unittest import mock
 
 import bs4
-import pandas as pd
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
@@ -27,17 +26,6 @@ def test_tables_are_those_of_the_files() -> None:
     for text in texts:
         assert documents.written(text) == text, "run python benchmarks/documents.py"
     assert all(f"<!-- table: {name} -->" in "".join(texts) for name in documents.TABLES)
-
-
-def test_the_readme_has_the_measured_size_of_maps() -> None:
-    """Catches a size of map files that no measured room or walk has."""
-    readme = (documents.PROJECT / "README.md").read_text()
-    said = [*map(int, re.search(r"one file of (\d+) to (\d+) MB", readme).groups())]
-    folder, sizes = documents.PROJECT / "paper_tables", []
-    for name in ("beyond/points.csv", "corrected/walks.csv"):
-        rows = pd.read_csv(folder / name)
-        sizes += [*rows.loc[rows["method"].str.startswith("NeuS+ corrected"), "map_mb"]]
-    assert said == [round(min(sizes)), round(max(sizes))]
 
 
 def test_the_exercises_have_the_answers_of_the_code() -> None:

@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import Frame
 from nbtrack.fields import FIELDS, MappingSettings, NetworkSettings, NeusMapping, make_field
-from nbtrack.machinery.device import constant, matrix_products, threads
+from nbtrack.machinery.device import constant
 from nbtrack.machinery.errors import NbtrackError
 from nbtrack.machinery.files import absolute
 from nbtrack.machinery.settings import read_setting
@@ -74,7 +73,6 @@ DENSITY = make_field("imap", NETWORK, SceneBounds(*UNIT), 0)
 REFUSED = {
     "zero pose": lambda: tracker(pose=np.zeros((4, 4))),
     "zero pose for a picture": lambda: DENSITY.render_view(CAMERA, np.zeros((4, 4))),
-    "a map for a field": lambda: tracker(mapped()),
     "part of a pixel": lambda: tracker(n_pixels=16.7),
     "part of a seed": lambda: mapped(seed=0.5),
     "part of an iteration": lambda: mapped(settings=NeusMapping(**SMALL | {"iterations": 2.5})),
@@ -99,22 +97,17 @@ REFUSED = {
     "points of two": lambda: BoxRoom()(torch.zeros(5, 2)),
     "points of numpy": lambda: BoxRoom()(np.zeros((5, 3))),
     "a float depth": lambda: replace(SEQUENCE[1], depth_mm=SEQUENCE[1].depth_mm / 1000),
-    "images of numpy": lambda: Frame(CAMERA, SEQUENCE.colors[0], SEQUENCE.depths_mm[0]),
     "camera last": lambda: Frame.of_images(SEQUENCE.colors[0], SEQUENCE.depths_mm[0], CAMERA),
     "images for a frame": lambda: tracker().track(SEQUENCE.colors[0]),
     "a number for a budget": lambda: SdfTracker(BoxRoom(), np.eye(4), 20),
     "a number for one frame": lambda: tracker().track(SEQUENCE[1], 5),
-    "a class for a field": lambda: tracker(BoxRoom),
     "no settings": lambda: make_tracker("sdf", BoxRoom(), np.eye(4), StepBudget(1), {}),
     "fewer times": lambda: replace(SEQUENCE, times=SEQUENCE.times[:2]),
     "fewer numbers": lambda: replace(SEQUENCE, frame_ids=SEQUENCE.frame_ids[:2]),
     "a text for a length": lambda: replace(CAMERA, fx="24"),
-    "one number for a corner": lambda: SceneBounds(0, 1),
     "arguments swapped": lambda: track_sequence(SEQUENCE, tracker()),
     "mapped when swapped": lambda: map_sequence(SEQUENCE, "neus", NETWORK, NeusMapping(**SMALL)),
-    "no network": lambda: mapped(network=None),
     "written when swapped": lambda: write_map(mapped(), "here"),
-    "a field for a map": lambda: write_map("here", mapped().field),
     "no path": lambda: read_map(None),
     "an empty name": lambda: nbtrack.open_scene("", nbtrack.load_preset()),
     "a preset's name": lambda: nbtrack.open_scene("office", "smoke"),
@@ -135,17 +128,13 @@ REFUSED = {
     "steps and rates": tracked_with(steps=3, rates_hz=[10]),
     "steps by the clock": tracked_with(steps=3, clock=True),
     "a rate for rates": tracked_with(rates_hz=10),
-    "a name for names": tracked_with(methods="huber"),
     "a number for a method": lambda: find_methods([3]),
-    "a list for a method": lambda: find_methods([["sdf"]]),
     "a text for settings": lambda: find_methods([replace(SDF, settings="tracking.sdf.seed=1")]),
-    "a number for a setting": lambda: nbtrack.load_preset(settings=[1]),
     "a number for a clock": lambda: ClockBudget(10, clock=5),
     "no table of losses": lambda: write_map("here", replace(mapped(), history=None)),
     "a size for a camera": lambda: replace(SEQUENCE, intrinsics=(32, 24)),
     "a picture without a camera": lambda: DENSITY.render_view(None, np.eye(4)),
     "a pose in the complex plane": lambda: tracker(pose=np.eye(4) * 1j),
-    "workers for an execution": tracked_with(execution=2),
     "an array of one number": tracked_with(rates_hz=np.array(10)),
     "fewer tracked": lambda: nbtrack.track_scenes(**scenes(), tracked=2 * scenes()["scenes"]),
 }
@@ -220,21 +209,6 @@ def test_modes_do_not_matter(mode: str, monkeypatch) -> None:
         after = torch.get_default_dtype(), torch.is_grad_enabled(), torch.get_rng_state().tolist()
     assert after == before
     assert all(np.array_equal(a, b) for a, b in zip(found, everything(), strict=True))
-
-
-def test_threads_leave_the_process_as_it_was() -> None:
-    """Catches a setting of the process that the last of two threads restores to what the first had
-    made of it."""
-    torch.set_num_threads(2)
-    blocks = [(ThreadPoolExecutor(1), ExitStack()) for _ in range(2)]  # of a thread each
-    for thread, stack in blocks:
-        for block in (threads(1), matrix_products(tf32=True)):
-            thread.submit(stack.enter_context, block).result()
-    for thread, stack in blocks:
-        thread.submit(stack.close).result()
-    fresh = ThreadPoolExecutor(1)
-    assert fresh.submit(torch.get_num_threads).result() == 2
-    assert fresh.submit(torch.get_float32_matmul_precision).result() == "highest"
 
 
 COPIES = [copy.copy, copy.deepcopy, lambda t: pickle.loads(pickle.dumps(t))]

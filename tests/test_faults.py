@@ -1,13 +1,11 @@
 """Broken input of every kind: one clear line, exit status 2, and earlier results as they were."""
 
 import errno
-import io
 import json
 import os
 import resource
 import shlex
 import signal
-import sys
 import zipfile
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -182,19 +180,6 @@ def test_a_disk_that_fills_up_while_results_are_written(n_bytes: int, work: Path
         for command, place in commands:
             assert os.strerror(errno.EFBIG) in assert_refused(work, capsys, command, place)
     assert json.loads((work / "run/metrics.json").read_text())["frames"] == 5
-
-
-def test_streams_and_letters(tmp_path: Path, monkeypatch) -> None:
-    """Catches a daemon's command that ends at its first message, with nothing written, and one that
-    has done its work and cannot print a path with letters of other languages."""
-    for stream in (None, io.TextIOWrapper(io.BytesIO(), encoding="ascii")):
-        monkeypatch.setattr(sys, "stdout", stream)  # it is None where it is closed
-        monkeypatch.setattr(sys, "stderr", stream)
-        out = tmp_path / f"Küche{stream is None}"
-        assert main([*MAKE[:-1], str(out), "--n-frames", "2", "--width", "16"]) == 0
-        sys.stdout.close()
-        sys.stderr.close()
-        assert (out / "poses.txt").is_file()
 
 
 @pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])

@@ -9,26 +9,9 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+import recordings
 from PIL import Image
-from recordings import (
-    CAMERA,
-    N_FRAMES,
-    WRITERS,
-    Source,
-    along_rays,
-    camera_matrix,
-    camera_words,
-    change_camera,
-    depth,
-    larger,
-    matrix_text,
-    short,
-    source,
-    tum_lines,
-    write_image,
-    write_images,
-    write_recording,
-)
+from recordings import CAMERA, N_FRAMES, WRITERS, Source, matrix_text, source, write_recording
 
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
@@ -195,14 +178,14 @@ def test_texts_say_how_they_are_encoded(tmp_path: Path, format: str, encoding: s
 def test_cameras_of_other_names(scene: Path, tmp_path: Path) -> None:
     """Catches a calibration that is passed over: 7-Scenes' own, one folder up too, and K.txt."""
     (scene / "focal.txt").rename(scene / "K.txt")
-    (scene / "K.txt").write_text(matrix_text(camera_matrix(CAMERA)))
+    (scene / "K.txt").write_text(matrix_text(recordings.camera_matrix(CAMERA)))
     check_equal(read_sequence(scene), source())
     folder = write_recording("7scenes", tmp_path / "chess/seq-01")
     (note,) = open_recording(folder).notes
     assert note.startswith("the camera assumed for 7-Scenes, 585 px at 640x480: no intrinsics")
     for number, place in enumerate((folder.parent, folder)):
         camera = replace(CAMERA, fx=40.0 + number)
-        (place / "camera-intrinsics.txt").write_text(matrix_text(camera_matrix(camera)))
+        (place / "camera-intrinsics.txt").write_text(matrix_text(recordings.camera_matrix(camera)))
         check_equal(read_sequence(folder), source()._replace(camera=camera))
     assert open_recording(folder).notes == []
 
@@ -225,13 +208,16 @@ def test_everything_declared_otherwise(tmp_path: Path) -> None:
     """Catches a key of `sequence.toml` that is ignored, or applied the wrong way round, and one
     that a converted recording needs once more."""
     data = source()
-    in_quarters = depth(lambda d: 4.0 * d)(data)  # of a millimetre; with the error of a camera
-    short_by = short(0.0012 / 4)(in_quarters)
-    raw = np.where(data.depths_mm == 0, np.uint16(60000), along_rays(short_by).depths_mm)
-    write_images(tmp_path, data._replace(depths_mm=raw), "image/{:06}.png")
+    # In quarters of a millimetre, with the error of a camera.
+    in_quarters = recordings.depth(lambda d: 4.0 * d)(data)
+    short_by = recordings.short(0.0012 / 4)(in_quarters)
+    raw = recordings.along_rays(short_by).depths_mm
+    raw[data.depths_mm == 0] = 60000
+    recordings.write_images(tmp_path, data._replace(depths_mm=raw), "image/{:06}.png")
     opengl = np.linalg.inv(data.poses @ np.diag([1.0, -1, -1, 1]))
-    (tmp_path / "poses.txt").write_text(tum_lines(np.arange(N_FRAMES) / 10, opengl, "wxyz"))
-    matrix = camera_matrix(CAMERA).T.ravel().tolist()  # by columns, as Open3D writes it
+    lines = recordings.tum_lines(np.arange(N_FRAMES) / 10, opengl, "wxyz")
+    (tmp_path / "poses.txt").write_text(lines)
+    matrix = recordings.camera_matrix(CAMERA).T.ravel().tolist()  # by columns, as Open3D writes it
     open3d = {"width": 48, "height": 36, "intrinsic_matrix": matrix}
     (tmp_path / "camera_primesense.json").write_text(json.dumps(open3d))
     (tmp_path / "sequence.toml").write_text(
@@ -255,7 +241,7 @@ def test_a_lens_is_corrected(tmp_path: Path) -> None:
     depth[..., round(100 + 100 * 0.475) :] = 2000
     data = Source(color, depth, np.eye(4)[None], Intrinsics.from_focal(200, 160, 100.0))
     folder = write_recording("plain", tmp_path / "r", data)
-    change_camera(folder, distortion=[-0.2, 0, 0, 0])
+    recordings.change_camera(folder, distortion=[-0.2, 0, 0, 0])
     row = read_sequence(folder).depths_mm[0, 80]
     assert abs(int((row == 1000).sum()) - 150) <= 1
 
@@ -294,11 +280,11 @@ def test_a_lens_by_any_name(plain: Path) -> None:
         {"distortion": None, "coeffs": lens},
         {"coeffs": None, **named, "distortion_model": "rational_polynomial", "skew": 0},
     ):
-        change_camera(plain, **words)
+        recordings.change_camera(plain, **words)
         seen.append(read_sequence(plain).depths_mm)
     assert (seen[0] != seen[1]).any()
     assert all(np.array_equal(seen[1], depths) for depths in seen[2:])
-    change_camera(plain, tangential=[0, 0.1])
+    recordings.change_camera(plain, tangential=[0, 0.1])
     with pytest.raises(DataError, match=r"tangential is .*, which is not used"):
         read_sequence(plain)
 
@@ -308,7 +294,7 @@ def test_a_unit_of_depth_in_a_camera_file(plain: Path, scale: dict[str, float]) 
     """Catches a unit that is ignored, or that is stronger than the declaration; what is not used of
     the file is named."""
     before = read_sequence(plain).depths_mm
-    change_camera(plain, **scale, serial="17")
+    recordings.change_camera(plain, **scale, serial="17")
     np.testing.assert_allclose(read_sequence(plain).depths_mm, before / 4, atol=1)
     assert "not used of intrinsics.json: serial" in open_recording(plain).notes
     (plain / "sequence.toml").write_text("depth_scale = 2000")
@@ -318,14 +304,14 @@ def test_a_unit_of_depth_in_a_camera_file(plain: Path, scale: dict[str, float]) 
 def test_images_of_other_sizes(plain: Path) -> None:
     """Catches full-size intrinsics used for reduced images (of cropped ones: BROKEN), the refusal
     of what LiDAR phones record, and a calibration of no size that is taken for any."""
-    large = larger(source(), 4)
-    change_camera(plain, **camera_words(large.camera, "width", "height"))
+    large = recordings.larger(source(), 4)
+    recordings.change_camera(plain, **recordings.camera_words(large.camera, "width", "height"))
     check_equal(read_sequence(plain), source())
-    write_images(plain, large)
+    recordings.write_images(plain, large)
     recording = open_recording(plain)
     check_equal(read_frames(recording), source())
     assert "colour is made as small as depth: 192x144 and 48x36" in recording.notes
-    change_camera(plain, width=None, height=None)
+    recordings.change_camera(plain, width=None, height=None)
     with pytest.raises(DataError, match=r"192x144 and 48x36, and .* does not say which"):
         read_sequence(plain)
 
@@ -346,7 +332,7 @@ def test_images_as_cameras_write_them(plain: Path) -> None:
     assert np.abs(after.colors.astype(int) - before.colors).mean() < 3
     depth = before.depths_mm[0].copy()
     depth[:9] = 65535
-    write_image(plain / "depth/000000.png", depth)
+    recordings.write_image(plain / "depth/000000.png", depth)
     after = read_sequence(plain)
     assert (after.depths_mm[0, :9] == 0).all()
     assert (after.depths_mm[0, 9:] == before.depths_mm[0, 9:]).all()

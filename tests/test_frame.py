@@ -1,6 +1,5 @@
 """One frame: a camera's images, sound or not, and a tracker that is fed them."""
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -84,16 +83,6 @@ def test_a_spoilt_frame_is_survived_and_flagged(case: str) -> None:
             assert estimate.lost or error_m(estimate.T_world_camera, sequence, index) < LOST
     assert not estimate.lost
     assert error_m(estimate.T_world_camera, sequence, index) < 0.01
-
-
-def test_images_that_are_none(monkeypatch) -> None:
-    """Catches a traceback for what a camera's driver returns when it has no image, where types are
-    not checked at each call."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-    color = np.zeros((12, 16, 3), np.uint8)
-    for depth in (None, [[1.0]], torch.ones(12, 16)):
-        with pytest.raises(DataError, match=f"depth is {type(depth).__name__}: give a num"):
-            Frame.of_images(CAMERA_OF_BUFFERS, color, depth)
 
 
 def test_memory_may_be_used_again() -> None:

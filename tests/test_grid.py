@@ -22,7 +22,6 @@ from tiny import tiny_words
 
 from nbtrack.cli import main
 from nbtrack.experiments.jobs import Execution, Job, Report, run_jobs
-from nbtrack.experiments.workers import processes
 from nbtrack.machinery.errors import DataError
 
 _MAIN = os.getpid()  # of this process, also in workers, which are forked
@@ -193,17 +192,6 @@ def test_no_scheduler(address: str, capsys, monkeypatch, tmp_path: Path) -> None
     monkeypatch.setattr("nbtrack.experiments.workers._SECONDS_TO_CONNECT", 0.5)
     assert tables(tmp_path, "--dask", address) == 2
     assert f"no Dask scheduler at {address!r}" in capsys.readouterr().err.splitlines()[-1]
-
-
-def test_a_handler_that_is_not_pythons(monkeypatch) -> None:
-    """Catches Ctrl-C that is ignored for good, once a worker began, where Python does not know the
-    handler, as in a program that embeds it."""
-    handlers = [None]
-    monkeypatch.setattr(signal, "getsignal", lambda number: handlers[-1])
-    monkeypatch.setattr(signal, "signal", lambda _, new: handlers.append(new) or handlers[-2])
-    with processes(1) as workplace:
-        workplace.begin()
-    assert handlers[-1] is None
 
 
 # To the whole group, as a terminal does; a shell's background jobs ignore it.

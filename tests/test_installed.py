@@ -16,7 +16,6 @@ from test_own_method import OWN
 from tiny import TINY
 
 from nbtrack import provenance
-from nbtrack.beyond import observed
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
@@ -70,19 +69,6 @@ def test_help_is_quick_and_needs_no_torch(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "nbtrack", "track", "--help"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
     assert "--map-from" in done.stdout
-
-
-def test_without_a_place_for_compiled_code(monkeypatch) -> None:
-    """Catches commands that end because numba can write its cache nowhere."""
-    real = observed.njit
-
-    def without_cache(cache: bool = False, **options: object):
-        if cache:
-            raise RuntimeError("cannot cache function 'add': no locator available")
-        return real(**options)
-
-    monkeypatch.setattr(observed, "njit", without_cache)
-    assert observed.compiled(lambda a, b: a + b)(2, 3) == 5
 
 
 FEW = [

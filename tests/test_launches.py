@@ -5,9 +5,6 @@ a step takes from elsewhere, or reads on the host, is seen here as on a GPU.
 """
 
 import gc
-import os
-import subprocess
-import sys
 import warnings
 from contextlib import ExitStack
 from pathlib import Path
@@ -266,18 +263,3 @@ def test_running_out_of_memory_names_the_setting() -> None:
     # A wrong shape is no lack of memory.
     with pytest.raises(RuntimeError, match="size of tensor"), advise_on_memory("x"):
         torch.ones(2) + torch.ones(3)
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="no processes by fork here")
-def test_a_child_by_fork_computes() -> None:
-    """Catches a child, such as a loader's or a server's, that waits for ever for threads that its
-    parent has used and that it does not have."""
-    code = (
-        "import os, signal, sys, torch; from nbtrack.machinery import device\n"
-        "torch.set_num_threads(2)\n"
-        "work = lambda: torch.rand(1000, 1000).exp().sum()\n"
-        "work()\n"
-        "if child := os.fork(): sys.exit(os.waitpid(child, 0)[1] != 0)\n"
-        "signal.alarm(10), work(), os._exit(0)\n"
-    )
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -7,7 +7,6 @@ import shlex
 import shutil
 import sys
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -25,14 +24,12 @@ from tiny import tiny_words
 
 from nbtrack import load_preset, track_scenes
 from nbtrack.cli import main
-from nbtrack.experiments.runs import read_trajectory
 from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
 from nbtrack.machinery import files
 from nbtrack.machinery.device import threads
 from nbtrack.machinery.errors import DataError
-from nbtrack.plots.movie import rerun_bytes
 from nbtrack.recordings.pose_files import read_tum
-from nbtrack.recordings.reading import read_frames, read_sequence
+from nbtrack.recordings.reading import read_frames
 from nbtrack.recordings.recording import open_recording
 from nbtrack.synthetic import make, room
 
@@ -232,18 +229,6 @@ def test_far_from_the_origin(tmp_path: Path, capsys) -> None:
     assert_refused(tmp_path, capsys, command, "frame 2 is no rigid transform")
 
 
-def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
-    """Catches a file of the user's that is overwritten through a link with a name to be guessed."""
-    victim = tmp_path / "victim"
-    victim.write_text("precious")
-    for name in (f".result.txt.{os.getpid()}.tmp", "result.txt"):
-        (tmp_path / name).symlink_to(victim)
-    files.write_atomic(tmp_path / "result.txt", "new")
-    assert victim.read_text() == "precious"
-    assert (tmp_path / "result.txt").read_text() == "new"
-    assert not (tmp_path / "result.txt").is_symlink()
-
-
 @pytest.mark.parametrize("format", ["neural_rgbd", "tum"])  # depth in mm, and in another unit
 def test_shared_frames_are_those_read_anew(format: str, tmp_path: Path) -> None:
     """Catches frames that change places where others were read before, and copies of what a slice
@@ -258,41 +243,9 @@ def test_shared_frames_are_those_read_anew(format: str, tmp_path: Path) -> None:
     assert np.shares_memory(whole.colors, part.colors)
 
 
-def rows_of(file: Path) -> Counter[tuple[str, bool]]:
-    """How many rows a file holds, by what they are of, and whether they hold at all times."""
-    from rerun.chunk import RrdReader
-
-    rows = Counter()
-    for part in RrdReader(str(file)).stream():
-        rows[part.entity_path, part.is_static] += part.num_rows
-    return rows
-
-
 def test_without_rerun(finished: Path, monkeypatch, capsys) -> None:
     """Catches a traceback of imports, or minutes of meshing before it is told."""
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.setattr("nbtrack.experiments.exports.extract_mesh", None)
     command = ["export", str(finished / "run"), "--to", "rrd", str(finished / "run.rrd")]
     assert_refused(finished, capsys, command, "pip install 'nbtrack[rerun]'")
-
-
-def test_what_the_file_holds(finished: Path, tmp_path: Path) -> None:
-    """Catches frames, images, paths or verdicts that are missing in the viewer; a map of points
-    that has no faces, and frames that were not all shown."""
-    pytest.importorskip("rerun")
-    out = tmp_path / "run.rrd"
-    assert main(["export", str(finished / "run"), "--to", "rrd", str(out)]) == 0
-    tracked, rows = read_trajectory(finished / "run"), rows_of(out)
-    assert all(rows[f"/world/{name}", True] == 1 for name in ("map", "tracked", "true", "camera"))
-    assert rows["/world", True] == 1  # where the origin lies in the recording's world
-    for name in ("world/camera", "world/camera/color", "world/camera/depth", "error_m", "lost"):
-        assert rows[f"/{name}", False] == len(tracked.frames)
-    recording = read_sequence(tracked.metrics["recording"])
-    points = trimesh.PointCloud(np.eye(3), np.full((3, 4), 255, np.uint8))
-    run = replace(tracked, frames=tracked.frames.assign(lost=True))
-    content = rerun_bytes(points, recording.select(slice(1, 3)), run, "points")
-    out.write_bytes(content)
-    rows = rows_of(out)
-    assert rows["/world/camera/color", False] == 2
-    assert rows["/lost", False] == len(run.frames)
-    assert rows["/world/map", True] == 1

@@ -273,13 +273,6 @@ def test_poses_that_are_not_known_leave_gaps(sequence) -> None:
     plots.plot_mesh({"room": room_mesh()}, paths)
 
 
-def test_a_notebook_shows_figures_whatever_their_files_are() -> None:
-    """Catches cells without figures where a user's matplotlib saves figures as SVG."""
-    with matplotlib.rc_context({"savefig.format": "svg"}):
-        picture = plots.plot_curves(SWEEP, "time (ms)", "ATE (cm)", "method")._repr_png_()
-    assert picture.startswith(b"\x89PNG")
-
-
 def test_steps_begin_at_their_start(sequence) -> None:
     """Catches a path of steps in the world's axes, in another unit, also in its title, or without
     its first pose."""

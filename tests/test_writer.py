@@ -49,16 +49,6 @@ def test_what_is_declared_is_converted(tmp_path: Path) -> None:
         assert read_sequence(tmp_path / f"{unit}").declared_unit == unit
 
 
-def test_names_as_long_as_a_file_system_allows(tmp_path: Path) -> None:
-    """Catches names of temporary files and of results that are too long beside a long name."""
-    long, out = tmp_path / ("ä" * 117 + "b"), tmp_path / ("c" * 255)
-    assert main(["data", "make", "office", "--n-frames=3", "--width=32", "--out", str(long)]) == 0
-    assert main(["data", "convert", str(long), str(out)]) == 0
-    made = ["map", str(out), "--field=points", "--out", str(tmp_path / ("d" * 255))]
-    assert main(made) == 0
-    assert main(["export", made[-1], "--to=ply", str(tmp_path / ("e" * 251 + ".ply"))]) == 0
-
-
 def test_interrupted_writer_leaves_nothing_behind(tmp_path: Path) -> None:
     """Catches a half-written scene that a later run would take for a whole one, and a folder that
     is overwritten."""

@@ -37,8 +37,9 @@ def choose_device() -> torch.device:
         device = torch.device(name)
         torch.zeros(1, device=device).item()  # raises on `meta`, too, whose tensors have no values
     except (RuntimeError, AssertionError, NotImplementedError, ImportError):
-        devices = ["cpu", *(f"{accelerator}:{i}" for i in range(torch.accelerator.device_count()))]
-        raise ConfigError(f"no device {name!r}: this machine has {', '.join(devices)}") from None
+        count = torch.accelerator.device_count()
+        devices = ", ".join(["cpu", *(f"{accelerator}:{i}" for i in range(count))])
+        raise ConfigError(f"no device {name!r:.80}: this machine has {devices}") from None
     return device
 
 

@@ -59,7 +59,7 @@ def read_setting(setting: str) -> dict[str, Any]:
     """
     key, equals, text = [part.strip() for part in setting.partition("=")]
     if not equals:
-        raise ConfigError(f"setting {setting!r} has no value: write key=value")
+        raise ConfigError(f"setting {setting!r:.80} has no value: write key=value")
     try:
         parsed = tomllib.loads(f"value = {text}")
     # RecursionError: lists that are nested thousands deep.
@@ -68,7 +68,7 @@ def read_setting(setting: str) -> dict[str, Any]:
             raise ConfigError(f"{text!r:.40} is no TOML: write \"{key}=['a', 'b']\"") from None
         parsed = {"value": text}  # a bare word is a string
     if len(parsed) > 1:  # the text has line ends, after which TOML may set other names
-        raise ConfigError(f"setting {setting!r} holds more than one: give each by itself")
+        raise ConfigError(f"setting {setting!r:.80} holds more than one: give each by itself")
     return flat({key: parsed["value"]})
 
 
@@ -154,11 +154,12 @@ def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
     # infinity here, which the checks below refuse.
     if type(value) is int and (wanted is float or abs(value) > 1e300):
         value = float(value) if abs(value) < 1e300 else math.inf
+    found = f"{key} = {value!r:.80}"
     if type(value) is not wanted or (wanted is str and "\0" in value):
-        raise ConfigError(f"{key} = {value!r}: it must be {wanted.__name__}, for example {old!r}")
+        raise ConfigError(f"{found}: it must be {wanted.__name__}, for example {old!r}")
     limits = allowed.get("limits", _USUAL_LIMITS.get(wanted))
     if limits and not limits[0] <= value <= limits[1]:
-        raise ConfigError(f"{key} = {value!r}: it must be {limits[0]:g} to {limits[1]:g}")
+        raise ConfigError(f"{found}: it must be {limits[0]:g} to {limits[1]:g}")
     if value not in allowed.get("choices", [value]):
-        raise ConfigError(f"{key} = {value!r}: write {' or '.join(map(repr, allowed['choices']))}")
+        raise ConfigError(f"{found}: write {' or '.join(map(repr, allowed['choices']))}")
     return value

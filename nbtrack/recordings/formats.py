@@ -53,8 +53,8 @@ class Declaration:
     def __post_init__(self) -> None:
         if len(self._axes) != 3 or not np.linalg.det(self._axes):
             raise ConfigError(
-                f"camera_axes = {self.camera_axes!r}: write 'opencv', 'opengl', or where x, y and "
-                "z point, as in 'right up forward' (of right/left, up/down, forward/backward)"
+                f"camera_axes = {self.camera_axes!r:.80}: write 'opencv', 'opengl', or where x, y "
+                "and z point, as in 'right up forward' (of right/left, up/down, forward/backward)"
             )
 
     @property

@@ -33,7 +33,7 @@ def parse_frames(text: str) -> slice:
     parts = r"(-?\d{1,18})?:(-?\d{1,18})?(?::([1-9]\d{0,17})?)?"
     match = re.fullmatch(parts, str(text).replace(" ", ""))
     if not match:
-        raise DataError(f"frames {text!r} is no slice: write A:B, or A:B:S with S above 0")
+        raise DataError(f"frames {text!r:.80} is no slice: write A:B, or A:B:S with S above 0")
     return slice(*(int(part) if part else None for part in match.groups()))
 
 
