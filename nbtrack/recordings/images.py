@@ -230,10 +230,9 @@ def _resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> tup
     if factor <= 1 or abs(factor * depth_height - height) > 1:  # sides are rounded to whole pixels
         return False, ""
     sizes = f"{width}x{height} and {depth_width}x{depth_height}"
-    camera = recording.calibration
-    if not camera.size:
-        doubt = f"{camera.source} does not say which of both it is for: write width and height too"
-        raise DataError(f"colour and depth are {sizes}, and {doubt}, into a JSON file")
+    if not recording.calibration.size:
+        doubt = f"{recording.calibration.source} does not say which of both it is for"
+        raise DataError(f"colour and depth are {sizes}, and {doubt}: write JSON with width, height")
     return True, f"colour is made as small as depth: {sizes}"
 
 

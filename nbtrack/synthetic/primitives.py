@@ -42,18 +42,16 @@ def _round_interval(offsets: Origins, directions: Points, radius: float) -> Inte
 
     It is empty (near = inf, far = -inf) for rays that miss.
     """
-    squared = row_dot(directions, directions)
+    # A ray parallel to a cylinder's axis has a direction of 0 here, where only components
+    # perpendicular to the axis are given. It is always inside or never. With a tiny `a` both ends
+    # of its interval are far away; 0 would give 0/0.
+    a = np.maximum(row_dot(directions, directions), 1e-30)
     b = row_dot(offsets, directions)
     c = row_dot(offsets, offsets) - radius**2
-    # A ray parallel to a cylinder's axis has a direction of 0 here, where only components
-    # perpendicular to the axis are given. It is always inside or never; the 1 avoids a division
-    # by 0.
-    crosses = squared > 1e-24
-    a = np.where(crosses, squared, 1.0)
     discriminant = b * b - a * c
-    met = np.where(crosses, discriminant > 0.0, c < 0.0)
-    half_width = np.where(crosses, np.sqrt(np.maximum(discriminant, 0.0)) / a, np.inf)
-    return np.where(met, -b / a - half_width, np.inf), np.where(met, -b / a + half_width, -np.inf)
+    half_width = np.sqrt(np.maximum(discriminant, 0.0)) / a
+    half_width[discriminant <= 0.0] = -np.inf  # for rays that miss
+    return -b / a - half_width, -b / a + half_width
 
 
 class Solid:
