@@ -172,7 +172,7 @@ def test_texts_say_how_they_are_encoded(tmp_path: Path, format: str, encoding: s
             mark = "\ufeff" if encoding == "utf-16-le" else ""
             path.write_bytes((mark + text).encode(encoding))
     check_equal(read_sequence(folder), source(), format in LOSSY)
-    assert open_recording(folder).declared.no_depth == 9
+    assert open_recording(folder).declared.no_depth == (9,)
 
 
 def test_cameras_of_other_names(scene: Path, tmp_path: Path) -> None:

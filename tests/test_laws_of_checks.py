@@ -36,27 +36,30 @@ def test_a_value_that_many_pixels_share() -> None:
     in three of eight frames."""
     counts = np.zeros((2, 6000), int)
     counts[0, 1:21], counts[:, 50] = 100, [1001, 3]
-    assert findings.no_depth_value(counts, frames()) == 50
+    assert findings.no_depth_values(counts, frames()) == [50]
+    two = counts.copy()
+    two[:, 7] = [1002, 3]
+    assert findings.no_depth_values(two, frames()) == [7, 50]
     still = frames(moved_mm=[0.0] * 5 + [900.0] * 3)
     few, flat, seldom, rare = (counts.copy() for _ in range(4))
     few[0, 10:21], flat[0, 50], seldom[1, 50] = 0, 1000, 2
     rare[0, 100:], rare[0, 50] = 20, 1001
     others = [(few, frames()), (flat, frames()), (seldom, frames()), (rare, frames())]
-    assert [findings.no_depth_value(*found) for found in [*others, (counts, still)]] == [0] * 5
+    assert not any(findings.no_depth_values(*found) for found in [*others, (counts, still)])
 
 
 def test_what_images_say() -> None:
     """Catches frames that count although the camera stands, and means in place of medians."""
     often, half = np.array([0, 3, 1]), [False, True] * 4
     dark = [0.01] * 5 + [0.9] * 3
-    (black,) = findings.of_images(frames(brightness=dark), 0, often)
+    (black,) = findings.of_images(frames(brightness=dark), [], often)
     assert "are black" in black
-    (repeated,) = findings.of_images(frames(is_repeated=half), 0, often)
+    (repeated,) = findings.of_images(frames(is_repeated=half), [], often)
     assert "50% of the depth images repeat" in repeated
     assert "::2 of map" in repeated
-    (shared,) = findings.of_images(frames(), 1, often)
+    (shared,) = findings.of_images(frames(), [1], often)
     assert "75% of the depths are 1," in shared
-    (none,) = findings.of_images(frames(measured=0.0), 0, often)
+    (none,) = findings.of_images(frames(measured=0.0), [], often)
     assert "no pixel" in none
     assert [*findings.of_images(frames(is_repeated=half, moved_mm=0.0), 0, often)] == []
 
@@ -80,13 +83,12 @@ def test_what_depths_say() -> None:
     assert [*findings.of_units(usual)] == [*findings.of_units(usual * 20)] == []
     for factor in (0.15, 25):
         assert "median depth is" in next(findings.of_units(factor * usual))
-    assert [*findings.of_depths(frames(), usual, 1000)] == []
-    (steps,) = findings.of_depths(frames(depth_step=[50, 100] * 4), usual, 1000)
-    assert "steps of 5.0 cm" in steps
+    assert [*findings.of_depths(usual)] == []
+    assert findings.steps_of(frames(depth_step=[50, 100] * 4), usual, 1000) == 0.05
     for step, depth in ((9, usual), (50, usual / 4)):
-        assert [*findings.of_depths(frames(depth_step=step), depth, 1000)] == []
+        assert findings.steps_of(frames(depth_step=step), depth, 1000) == 0
     far = pd.concat([usual, pd.Series([50.0, 60.0])], ignore_index=True)
-    (outliers,) = findings.of_depths(frames(), far, 1000)
+    (outliers,) = findings.of_depths(far)
     assert outliers.startswith("1.96% of the depths are outliers, 50 to 60 m away")
 
 

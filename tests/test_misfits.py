@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recordings import camera, depth, positions, real, short, source, with_noise, write_matrices
+from scipy.interpolate import interp1d
+from scipy.spatial.transform import Rotation, Slerp
 
 from nbtrack.checks.check import DataReport, check_recording, quick_look
 from nbtrack.checks.readings import cost_of
@@ -64,6 +66,22 @@ def fill(value: int, share: float):
     return depth(lambda d: np.where(d > np.quantile(d[d > 0], 1 - share), value, d))
 
 
+def two_values(depths: np.ndarray) -> np.ndarray:
+    depths = depths.copy()
+    depths[:, :, :8], depths[:, :, -8:] = 1, 10000
+    return depths
+
+
+def halfway(data):
+    """Poses of two frames and a half later."""
+    numbers = np.arange(len(data.poses))
+    later, poses = (numbers + 2.5).clip(0, numbers[-1]), data.poses.copy()
+    turns = Slerp(numbers, Rotation.from_matrix(poses[:, :3, :3]))
+    poses[:, :3, :3] = turns(later).as_matrix()
+    poses[:, :3, 3] = interp1d(numbers, poses[:, :3, 3], axis=0)(later)
+    return data._replace(poses=poses)
+
+
 def of_disparity(depths: np.ndarray) -> np.ndarray:
     return np.where(depths > 0, 1.7e6 / np.maximum(depths, 100), 0)
 
@@ -80,6 +98,10 @@ CASES = {
     "a quadratic error": (short(0.008), "depths are short by a quadratic", 0.008, 0.002),
     "depth 8 cm long": (depth(lambda d: d + 80 * (d > 0)), "depths are short by", -0.08, 0.015),
     "none is 10000": (fill(10000, 0.3), "30% of the depths are 10000.*no_depth =", 10000, 0),
+    "none is 1 or 10000": (depth(two_values), ".* are 1 or 10000.*no_depth = .1, 10000", 0, 0),
+    "two poses and a half late": (halfway, "depth comes after", 2.5, 0.3),
+    "positions of another scale": (positions(lambda t: 0.4 * t), "depths should change", -60, 1),
+    "steps of 10 cm": (depth(lambda d: d // 100 * 100), "depths come in steps of", 10, 0),
     "disparity": (depth(of_disparity), UNTOLD, 0, 0),
     "poses drifting by 50 cm": (positions(drifting), UNTOLD, 0, 0),
 }  # fmt: skip

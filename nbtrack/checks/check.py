@@ -95,10 +95,9 @@ class DataReport:
 
 
 def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
-    """Read every frame of a recording and report what is there and whether it fits together.
+    """Check every frame of a recording, or unless `is_whole` some pairs of frames, within seconds.
 
-    Unless `is_whole`, only some pairs of frames are read, in a second or two. Raises what
-    `read_frames` does, and DataError if `is_whole` and no pixel has a depth.
+    Raises what `read_frames` does, and DataError if `is_whole` and no pixel has a depth.
     """
     ids = select_frames(recording, slice(None))
     T_world_camera = shifted(recording.T_world_camera[ids], -recording.origin)
@@ -108,8 +107,8 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     as_declared = Reading(recording.declared, sequence.intrinsics)
-    no_depth = findings.no_depth_value(counts, frames)
-    sequence.depths_mm[sequence.depths_mm == no_depth] = 0  # changes nothing if `no_depth` is 0
+    no_depth = findings.no_depth_values(counts, frames)
+    sequence.depths_mm[np.isin(sequence.depths_mm, no_depth)] = 0
     frame_pairs = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(frame_pairs, as_declared)
     cloud = _cloud(as_declared, sequence)
@@ -121,13 +120,14 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     causes = ProgressBar("fitting", CAUSES.items() if declared_is_best and has_enough else [])
     misfits = [fit(frame_pairs, as_declared, as_declared, name, keys) for name, keys in causes]
     main = main_misfits(frame_pairs, as_declared, misfits)
-    misread = findings.misreading(conventions[0], best, main)  # a sentence by its kind, or empty
+    step_m = findings.steps_of(frames, cloud.depth, recording.declared.depth_scale)
+    misread = findings.misreading(conventions[0], best, main, step_m)  # a sentence by its kind
     faults = [*findings.of_images(frames, no_depth, counts[0]), *misread.get("fault", [])]
     doubts, remarks = misread.get("doubt", []), misread.get("note", [])
     if declared_is_best:  # otherwise the numbers of poses and depths mean nothing
         faults += findings.of_poses(frames, recording) if "fault" not in misread else []
         faults += findings.of_units(cloud.depth[~is_far])
-        remarks += findings.of_depths(frames, cloud.depth, as_declared.declared.depth_scale)
+        remarks += findings.of_depths(cloud.depth)
     if not (faults or doubts):
         doubts = list(findings.doubts_of_poses(conventions, recording, is_whole, frames))
     return DataReport(
@@ -142,7 +142,8 @@ def quick_look(recording: Recording) -> str:
         return ""
     report = check_recording(recording, is_whole=False)
     kind = "warning" if report.faults or report.doubts else "note"
-    return next((f"{kind}: {text}" for text in report.warnings), "")
+    # What was assumed of its files is known only after images were read.
+    return next((f"{kind}: {text}" for text in (*report.warnings, *recording.notes)), "")
 
 
 def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:

@@ -24,23 +24,29 @@ _MAX_STEP = 0.01  # share of the depth: coarser steps of a camera's depth are re
 # in a larger share of the frames than _SHARING, and if it is more than _SPIKE times as frequent as
 # any other value (our choice).
 SHARED, _SHARING, _SPIKE = 0.01, 0.25, 10
+_VALUES = 3  # a camera has at most so many of them (our choice)
 _BLACK = 0.02  # the median brightness, in [0, 1], below which images are black
 
 
-def misreading(declared: Convention, best: Convention, main: list[Misfit]) -> dict[str, list[str]]:
+def misreading(
+    declared: Convention, best: Convention, main: list[Misfit], step_m: float = 0.0
+) -> dict[str, list[str]]:
     """A sentence about how the numbers are misread, by its kind: "fault", "doubt" or "note".
 
-    `best` is the result of `fit_all`, and `main` that of `main_misfits`. The dictionary is empty if
-    nothing is wrong. There are two kinds of mistakes:
-
-    - Another convention than the declared one is the best, or a cause explains the gaps, which then
-      are those of right recordings. It is a "note" if usual sensors have such an error, and a
-      "fault" otherwise.
+    `best` is from `fit_all`, and `main` from `main_misfits`. Nothing is returned of a right reading.
+    - Another convention is the best, or a cause explains the gaps, which then are those of right
+      recordings: a "note" if usual sensors have such an error, else a "fault".
+    - Depths come in steps (m; 0: none), and the gaps are below half a step: a "doubt", or a "note"
+      if they are those of right recordings.
     - Surfaces lie apart without a known cause: a "doubt", or a "fault" if they lie far apart.
     """
     depth_mm = 1e3 * declared.depth_m
     usual_mm = declared.usual_apart * depth_mm
     apart = f"lie {declared.apart * depth_mm:.0f} mm apart" if declared.overlap else "never meet"
+    if best is declared and declared.apart * depth_mm < 1e3 * step_m / 2:
+        advice = "use the camera's own depth files, or expect no better poses"
+        text = f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
+        return {"note" if declared.apart <= declared.usual_apart else "doubt": [text]}
     if best is not declared:
         reading, name, left_mm = best.reading, str(best), 1e3 * best.apart * best.depth_m
         kind = "fault"
@@ -53,9 +59,9 @@ def misreading(declared: Convention, best: Convention, main: list[Misfit]) -> di
             f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
             "and nothing that is tried explains it: no other axes, units or directions of poses "
             "and depth, no late depth, no focal lengths or principal point, no error of depth (a "
-            "factor up to 1.5, a length, a square), no offset of the camera. What cannot be told: "
-            "poses that drift, jump or have a scale of their own, a lens's distortion, and depth "
-            "images that hold no depth (disparity, half floats, each frame scaled by itself)"
+            "factor, a length, a square), no offset of the camera. What cannot be told: poses that "
+            "drift or jump, a lens's distortion, and depth images that hold no depth (disparity, "
+            "half floats, each frame scaled by itself)"
         )
         return {"fault" if declared.is_far_apart else "doubt": [text]}
     else:
@@ -86,32 +92,36 @@ def doubts_of_poses(
         yield f"{file} is not proved: {reason}, such as {alike[0]}"
 
 
-def no_depth_value(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> int:
-    """The depth value that many pixels share although the camera moves; 0 if there is none.
+def no_depth_values(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> list[int]:
+    """The depth values, at most `_VALUES`, that many pixels share although the camera moves.
 
     Such a value is no measurement, but what the camera gives for none. `counts` and `frames` are
     those of `check`: `counts[0]` is how often each depth value occurs, and `counts[1]` in how many
     frames it is more than the share `SHARED` of the pixels.
     """
     n_pixels, n_frames = counts
-    second, most = np.argsort(n_pixels)[-2:]
-    is_frequent = n_pixels[most] > SHARED * n_pixels.sum() and np.count_nonzero(n_pixels) > _SPIKE
+    is_shared = (n_pixels > SHARED * n_pixels.sum()) & (n_frames > _SHARING * len(frames))
+    is_shared &= (np.count_nonzero(n_pixels) > _SPIKE) & (frames.moved_mm.median() > 0)
+    first = np.argsort(-n_pixels)[: _VALUES + 1]  # the most frequent values
     # A camera's rounding makes many values frequent, but none so much more than all others.
-    is_spike = n_pixels[most] > _SPIKE * n_pixels[second]
-    is_shared = n_frames[most] > _SHARING * len(frames) and frames.moved_mm.median() > 0
-    return int(most) if is_frequent and is_spike and is_shared else 0
+    is_last_spike = n_pixels[first[:-1]] > _SPIKE * n_pixels[first[1:]]
+    n_spikes = 1 + max(np.flatnonzero(is_last_spike), default=-1)
+    return sorted(int(value) for value in first[:n_spikes] if is_shared[value])
 
 
-def of_images(frames: pd.DataFrame, no_depth: int, often: Int[np.ndarray, "_"]) -> Iterator[str]:
+def of_images(
+    frames: pd.DataFrame, no_depth: list[int], often: Int[np.ndarray, "_"]
+) -> Iterator[str]:
     """Faults of images that do not depend on what their numbers mean.
 
-    `no_depth` is the result of `no_depth_value`, and `often[v]` how often the depth value v occurs.
+    `no_depth` is the result of `no_depth_values`; `often[v]` is how often the depth value v occurs.
     """
     if not frames.measured.any():
         advice = "check the depth folder, and no_depth in sequence.toml"
         yield f"no pixel that was looked at has a depth: all are 0, or saturated (65535); {advice}"
     if no_depth:
-        found = f"{often[no_depth] / often.sum():.0%} of the depths are {no_depth}"
+        found = f"{often[no_depth].sum() / often.sum():.0%} of the depths are "
+        found += " or ".join(map(str, no_depth))
         yield f"{found}, which is no measurement; set no_depth = {no_depth} in sequence.toml"
     # The first frame repeats none, so that the share is below 1 and 1 / (1 - repeated) is finite.
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
@@ -147,12 +157,8 @@ def of_units(depth: pd.Series) -> Iterator[str]:
         yield f"the median depth is {median:.3g} m, outside {near:g} to {far:g} m: {advice}"
 
 
-def of_depths(frames: pd.DataFrame, depth: pd.Series, depth_scale: float) -> Iterator[str]:
-    """Remarks about depths (m) that are read rightly: outliers, and coarse steps.
-
-    If the declared unit is wrong, depths and steps are wrong by the same factor; the test compares
-    them only with each other.
-    """
+def of_depths(depth: pd.Series) -> Iterator[str]:
+    """A remark about depths (m) that are read rightly, if some are outliers."""
     is_far = depth > far_limit(depth)
     if is_far.any():
         low, high = depth[is_far].min(), depth[is_far].max()
@@ -160,8 +166,14 @@ def of_depths(frames: pd.DataFrame, depth: pd.Series, depth_scale: float) -> Ite
         rule = f"more than {FAR:g} times as far as nine in ten: maps and tracking leave them out"
         advice = "check the camera, or set no_depth in sequence.toml to what it gives for none"
         yield f"{found}, {rule}; {advice}"
+
+
+def steps_of(frames: pd.DataFrame, depth: pd.Series, depth_scale: float) -> float:
+    """The step (m) between two values of depth (m) if it is coarse, else 0.
+
+    If the declared unit is wrong, depths and steps are wrong by the same factor; the test compares
+    them only with each other.
+    """
     step_m = np.gcd.reduce(frames.depth_step) / depth_scale
     # The steps may be chance if the farthest point is fewer than eight of them away.
-    if _MAX_STEP * depth.median() < step_m < depth.max() / 8:
-        advice = "use the camera's own depth files, or expect no better poses"
-        yield f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
+    return step_m if _MAX_STEP * depth.median() < step_m < depth.max() / 8 else 0.0

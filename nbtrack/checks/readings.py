@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt16
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -206,14 +207,15 @@ class FramePairs:
     def _T_second_first(self, reading: Reading) -> Tensor:
         """Poses of the first camera of each pair in the second camera's frame, (pairs, 4, 4; m)."""
         T_world_camera = reading.T_world_camera(self.file_poses, self.order)
-        # Depth that comes `late` frames after its pose was seen from an earlier pose, which lies
-        # between those of two frames. Neighbouring poses differ so little that their matrices may
-        # be interpolated element by element.
-        times = (self.pairs - reading.late).clip(0, len(T_world_camera) - 1)  # in frames
-        earlier = times.astype(int)
-        later = np.minimum(earlier + 1, len(T_world_camera) - 1)
-        share = (times - earlier)[..., None, None]
-        T_first, T_second = (1 - share) * T_world_camera[earlier] + share * T_world_camera[later]
+        if reading.late:
+            # Depth that comes `late` frames after its pose was seen from an earlier pose, which
+            # lies between those of two frames.
+            numbers = np.arange(len(T_world_camera))
+            times = (numbers - reading.late).clip(0, numbers[-1])  # in frames
+            R, t = Rotation.from_matrix(T_world_camera[:, :3, :3]), T_world_camera[:, :3, 3]
+            T_world_camera[:, :3, 3] = CubicSpline(numbers, t)(times)
+            T_world_camera[:, :3, :3] = Slerp(numbers, R)(times).as_matrix()
+        T_first, T_second = T_world_camera[self.pairs]
         return torch.from_numpy(np.linalg.solve(T_second, T_first)).float()
 
     def _area_gaps(self, gaps: Float[Tensor, "pairs points"]) -> Gaps:

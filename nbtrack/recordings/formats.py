@@ -39,7 +39,8 @@ class Declaration:
 
     format: str = ""  # a name in `FORMATS`; empty: the files tell the format
     depth_scale: float = limited(1000.0, 1e-8, 1e8)  # depth values a metre
-    no_depth: int = limited(0, 0, 65535)  # a depth value that means "not measured", besides 0
+    # Depth values that mean "not measured", besides 0.
+    no_depth: tuple[int, ...] = limited((0,), 0, 65535)
     depth_along: str = one_of("axis", "ray")  # the optical axis (z-depth), or the ray (distance)
     # 1/m: a measured depth m (metres) is truly m + depth_error_per_m * m². Within the limits the
     # true depth of 65 m is positive.
@@ -185,7 +186,7 @@ _FORMATS: dict[str, Format | str] = {
     "7scenes": Format(
         "7-Scenes", color=("*.color.*",), depth=("*.depth.*",), poses=("*.pose.txt",),
         cameras=("intrinsics.txt", "camera-intrinsics.txt", "../camera-intrinsics.txt"),
-        declared=Declaration(no_depth=65535),
+        declared=Declaration(no_depth=(65535,)),
         known_cameras=(Calibration(Path(), 585.0, 585.0, None, _VGA),),
     ),
     # Dai et al. 2017, as SensReader exports a scan. Colour shows the same view as depth, larger.

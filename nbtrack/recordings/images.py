@@ -147,7 +147,7 @@ class Images:
             color = cv2.remap(color, *self._maps, cv2.INTER_LINEAR)
             # An interpolated depth would be a point between two surfaces.
             depth = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST)
-        is_unmeasured = (depth == recording.declared.no_depth) | (depth == _MAX_16_BITS)
+        is_unmeasured = np.isin(depth, [*recording.declared.no_depth, _MAX_16_BITS])
         return color, np.where(is_unmeasured, 0, depth)
 
     def in_millimetres(self, depths: Depths, ids: Frames) -> Depths:
