@@ -33,7 +33,7 @@ def misreading(
 ) -> dict[str, list[str]]:
     """A sentence about how the numbers are misread, by its kind: "fault", "doubt" or "note".
 
-    `best` is from `fit_all`, and `main` from `main_misfits`. Nothing is returned of a right reading.
+    `best` is from `fit_all`, and `main` from `main_misfits`. It is empty if nothing is wrong.
     - Another convention is the best, or a cause explains the gaps, which then are those of right
       recordings: a "note" if usual sensors have such an error, else a "fault".
     - Depths come in steps (m; 0: none), and the gaps are below half a step: a "doubt", or a "note"
