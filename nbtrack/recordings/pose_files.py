@@ -21,26 +21,34 @@ _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 # What a line of a pose file may hold, for messages.
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _LATEST = 1e11  # s: no timestamp in seconds is later; one in milliseconds since 1970 is larger
+_SLOWEST = 5.0  # s: frames that are farther apart see too little of the same to be tracked
 # A time since 1970 in a name: seconds with decimals (9 or 10 digits before the point), or milli-,
 # micro- or nanoseconds (13, 16 or 19 digits).
 _STAMP = re.compile(r"(?a)(?<!\d)(?<!\d\.)([1-9]\d{8,9}\.\d+|1\d{12}(?:\d{3}){0,2})(?!\.?\d)")
 
 
 def in_seconds(times: Times) -> Times:
-    """Convert times in seconds, or in milli-, micro- or nanoseconds since 1970, to seconds.
+    """Convert times in seconds, or in milli-, micro- or nanoseconds, to seconds.
 
-    The unit is the largest of these in which the median of all times is below `_LATEST`. A time
-    that is not below it in this unit becomes NaN.
+    The unit is the largest of these in which the median of all times is below `_LATEST`, and in
+    which frames are less than `_SLOWEST` apart if their times are whole numbers that begin near 0.
+    A time that is not below `_LATEST` in this unit becomes NaN.
 
     >>> in_seconds(np.array([1403636579763555584.0, 1403636579796888917.0])).round(2).tolist()
     [1403636579.76, 1403636579.8]
     >>> in_seconds(np.array([0.5, 0.6, 1e13])).tolist()
     [0.5, 0.6, nan]
+    >>> in_seconds(np.array([0.0, 33.0, 67.0])).round(3).tolist()
+    [0.0, 0.033, 0.067]
     """
-    usual = np.nanmedian(np.abs(times)) if np.isfinite(times).any() else 0.0
+    known = times[np.isfinite(times)]
+    usual = np.median(np.abs(known)) if len(known) else 0.0
+    step = np.quantile(np.abs(np.diff(known)), 0.5, method="lower") if len(known) > 1 else 0.0
+    if (known % 1 != 0).any() or np.abs(known[:1]).sum() > 100 * step:  # no count from the start
+        step = 0.0
     units_s = np.array([1.0, 1e-3, 1e-6, 1e-9])
     # `argmax` finds the first unit that fits. If none fits, it is 0: the unit is a second.
-    unit_s = units_s[(usual * units_s < _LATEST).argmax()]
+    unit_s = units_s[((usual * units_s < _LATEST) & (step * units_s < _SLOWEST)).argmax()]
     return np.where(np.abs(times * unit_s) < _LATEST, times * unit_s, np.nan)
 
 
