@@ -15,6 +15,7 @@ from nbtrack.beyond.verdict import CORRELATED, MAD_FACTOR, p_within, std_when_mo
 from nbtrack.core.arrays import Pose, Transforms
 from nbtrack.data.frame import Frame
 from nbtrack.machinery.errors import ConfigError
+from nbtrack.machinery.settings import one_of
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
 
 # A point's correspondence is the nearest map point within this distance (m). A first alignment has
@@ -34,7 +35,7 @@ class IcpSettings(TrackerSettings):
     """Settings of ICP."""
 
     n_pixels: int = 512  # points a frame, of evenly spread pixels
-    motion_model: str = "better_of_both"
+    motion_model: str = one_of("better_of_both", "previous_pose", "constant_velocity")
 
 
 class IcpTracker(Tracker):

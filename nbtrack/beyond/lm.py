@@ -19,7 +19,7 @@ from nbtrack.beyond.views import Viewpoints, retrieve, view_of
 from nbtrack.core.arrays import Pose, Poses, Transform, Transforms
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field
-from nbtrack.machinery.settings import limited
+from nbtrack.machinery.settings import limited, one_of
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.starts import rigid
 from nbtrack.tracking.tracker import Estimate, Tracker, TrackerSettings
@@ -47,7 +47,7 @@ class LmSettings(TrackerSettings):
     """Settings of the Levenberg-Marquardt tracker. All defaults are our choice."""
 
     n_pixels: int = 512  # points a frame
-    motion_model: str = "better_of_both"
+    motion_model: str = one_of("better_of_both", "previous_pose", "constant_velocity")
     voxel: float = 0.04  # m; a field that is no grid is sampled in cells of this size
     # Weight of the intensity residual against that of the distance, each divided by its scale.
     lambda_intensity: float = 1.0

@@ -29,7 +29,6 @@ from nbtrack.mapping.files import Map
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M, still_metrics
 from nbtrack.tracking.reach import reach_metrics
-from nbtrack.tracking.starts import expected_poses
 from nbtrack.tracking.tracker import TrackerSettings
 
 RUN_FILE = "run.pt"
@@ -110,8 +109,6 @@ class TrackJob(Job):
     def check(self) -> None:
         """Raises ConfigError or DataError, before anything is made, if the run cannot begin."""
         T_first = self._true_path()[0]
-        # This raises an error for an unknown motion model; the pose does not matter.
-        expected_poses(self.settings.motion_model, [np.eye(4)])
         if not self._starts_at(T_first):  # the tracker then has to find the camera in the map
             tracker_class(self.tracker).check_finds(in_corrected=self.needs.correction_voxel > 0)
 

@@ -17,7 +17,7 @@ from nbtrack.machinery.device import suited_to, synchronize, usual_modes
 from nbtrack.machinery.errors import ConfigError, MissingError, NumericalError, typed
 from nbtrack.machinery.inputs import checked_pose, whole_number
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
-from nbtrack.machinery.settings import checked
+from nbtrack.machinery.settings import checked, one_of
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.reach import Reach
 from nbtrack.tracking.starts import expected_poses, rigid
@@ -28,7 +28,8 @@ class TrackerSettings:
     """Settings that all trackers share."""
 
     n_pixels: int = 4096  # random pixels for each step, or for each frame if they are drawn once
-    motion_model: str = "previous_pose"  # where a search starts, by a name in `expected_poses`
+    # Where a search starts, by a name in `expected_poses`.
+    motion_model: str = one_of("previous_pose", "constant_velocity", "better_of_both")
     tf32: bool = False  # matrix products in TF32, on NVIDIA's GPUs
 
     def reach(self, steps: float, metres_per_unit: float) -> Reach | None:
@@ -160,7 +161,6 @@ class Tracker(abc.ABC):
         generator and the budget are not reset.
         """
         self.estimates = [checked_pose(T_world_camera)]
-        expected_poses(self.settings.motion_model, self.estimates)  # checks the motion model's name
         for name in self.remembers:
             setattr(self, name, getattr(type(self), name))
 
