@@ -21,8 +21,6 @@ _FOLDERS = (
     "tracking",
 )  # fmt: skip
 _PACKAGES = ("numpy", "scipy", "numba", "small_gicp")  # that compute results beside torch
-# Modules that `package_code` and `versions` already cover.
-_COVERED = {"nbtrack", "torch", *sys.stdlib_module_names}
 # Folders into which packages are installed.
 _SITE = (*site.getsitepackages(), site.getusersitepackages(), sysconfig.get_path("platlib"))
 
@@ -68,11 +66,12 @@ def _code_of(kind: type) -> list[str]:
 def _installed(module: str) -> list[str]:
     """Names with versions of the distributions that installed a module.
 
-    Empty for a module that was not installed, and for those in `_COVERED`.
+    The list is empty for a module that was not installed, and for those of nbtrack and torch, whose
+    versions `versions` tells.
     """
     top = module.partition(".")[0]
     file = getattr(sys.modules.get(module), "__file__", None) or ""
-    if top in _COVERED or not file.startswith(_SITE):
+    if top in ("nbtrack", "torch") or not file.startswith(_SITE):
         return []
     names = importlib.metadata.packages_distributions().get(top, [])
     return [f"{name} {importlib.metadata.version(name)}" for name in names]
