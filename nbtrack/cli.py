@@ -4,6 +4,7 @@ import argparse
 import importlib
 import os
 import re
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -147,8 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for source in options.imports:
             importlib.import_module("nbtrack.machinery.registry").import_own(source)
         module = _MODULES.get(options.command, "commands")
-        commands = importlib.import_module(f"nbtrack.experiments.{module}")
-        status = getattr(commands, f"{options.command}_command")(options)
+        status = getattr(_imported(module), f"{options.command}_command")(options)
         print(end="", flush=True)  # raises BrokenPipeError here, and not when Python ends
         return status or 0
     except BrokenPipeError:  # the program that reads the output, such as `head`, has closed it
@@ -160,6 +160,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exception(error)
         print(f"nbtrack: {_message_of(error)}", file=sys.stderr)
         return 130 if isinstance(error, KeyboardInterrupt) else 2  # 130 is what shells return
+
+
+def _imported(module: str) -> Any:
+    """A module with commands. While it is imported, Ctrl-C ends the process at once.
+
+    Nothing is begun then, and libraries that are interrupted go on, or raise other errors.
+    """
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        return importlib.import_module(f"nbtrack.experiments.{module}")
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _writable(stream: TextIO | None) -> TextIO:

@@ -5,6 +5,7 @@ And what is printed while they run and no bar is shown: a line every 30 seconds.
 
 import json
 import shutil
+import signal
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -234,3 +235,17 @@ def test_short_work_is_silent(clock, capsys) -> None:
     with ProgressBar("short", 1) as bar:
         bar.move_to(1)
     assert capsys.readouterr().err == ""
+
+
+def test_ctrl_c_ends_an_import_at_once(monkeypatch) -> None:
+    """Catches a library that goes on with its import, or raises another error, after Ctrl-C."""
+    seen, before = [], signal.getsignal(signal.SIGINT)
+
+    def load(name: str) -> SimpleNamespace:
+        seen.append(signal.getsignal(signal.SIGINT))
+        return SimpleNamespace(methods_command=lambda options: 0)
+
+    monkeypatch.setattr("importlib.import_module", load)
+    assert main(["methods"]) == 0
+    assert seen == [signal.SIG_DFL]
+    assert signal.getsignal(signal.SIGINT) == before
