@@ -270,16 +270,15 @@ def with_maps(rows: pd.DataFrame, scene: Scene, preset: Preset, seed: int) -> pd
     """Add columns to rows of Table I in one scene: sizes of images and maps, and maps' scores."""
     rows["reach_over_motion"] = rows["reach_m"] / (rows["path_m"] / rows["frames"])
     rows["image_width"] = scene.read(":1").intrinsics.width
+    maps = []
     for name in TABLE_1:
-        made = map_scene(scene, METHODS[name].field, preset, seed).record
-        is_of_method = rows["method"] == METHODS[name].label
-        rows.loc[is_of_method, "units"] = made["network"]["width"]
-        rows.loc[is_of_method, "n_pixels"] = preset.tracking_of(METHODS[name].tracker).n_pixels
-        rows.loc[is_of_method, "iterations"] = made["settings"]["iterations"]
-        rows.loc[is_of_method, "mapping_seconds"] = made["seconds"]
-        for score, value in made["quality"].items():
-            rows.loc[is_of_method, score] = value
-    return rows
+        method = METHODS[name]
+        made = map_scene(scene, method.field, preset, seed).record
+        sizes = {"method": method.label, "units": made["network"]["width"]}
+        sizes["n_pixels"] = preset.tracking_of(method.tracker).n_pixels
+        sizes["iterations"] = made["settings"]["iterations"]
+        maps.append({**sizes, "mapping_seconds": made["seconds"], **made["quality"]})
+    return rows.merge(pd.DataFrame(maps), on="method", how="left")
 
 
 if __name__ == "__main__":
