@@ -178,7 +178,7 @@ def agreement(scene, preset) -> pd.DataFrame:
     found = track_scenes([scene], methods, preset, **how, execution=ALONE)
     runs = {f"{row.method}, seed {row.seed}": read_run(row.run) for row in found.itertuples()}
     paths = {name: run.T_estimated[:, :3, 3] for name, run in runs.items()}
-    paths["reference"] = next(iter(runs.values())).T_true[:, :3, 3]
+    paths["reference"] = read_run(found["run"].iloc[0]).T_true[:, :3, 3]
     rows = [
         (a, b, float(np.sqrt(np.mean(np.sum((paths[a] - paths[b]) ** 2, axis=-1)))))
         for a, b in combinations(paths, 2)

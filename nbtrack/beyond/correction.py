@@ -47,7 +47,7 @@ _MIN_SCALES = np.array([0.01, 0.05])
 _UNMEASURED = 0.1  # confidence at vertices where nothing was measured, and the network interpolates
 CORRECTIONS = ("numbers", "corrections", "cameras", "views", "residual_medians")
 """Names of a correction's tensors in a map file; `CorrectedField` explains them."""
-_SOURCE = "source."  # prefix of the uncorrected field's tensors in a map file
+_SOURCE = "source."  # prefix of the uncorrected field's tensors in `state_dict`
 
 
 class CorrectedField(BakedField):
@@ -81,19 +81,9 @@ class CorrectedField(BakedField):
         scales = np.maximum(_SCALES_PER_MEDIAN * medians, _MIN_SCALES)
         # A point is an inlier within 2.5 cm of the surface.
         self.accuracy = Accuracy(tuple(scales.tolist()), 0.025, float(medians[1]))
+        self.viewpoints = Viewpoints(self.cameras.double().numpy(), self.views)
         self.volume[4] = _UNMEASURED  # the channel of confidence
         self.volume[:, self.numbers.long()] += self.corrections.float().T
-
-    @property
-    def viewpoints(self) -> Viewpoints:
-        """Some of the poses that the map was made from, and the views from them."""
-        return Viewpoints(self.cameras.double().numpy(), self.views)
-
-    def state(self) -> State:
-        """The tensors of a map file: those of the field as mapped, and the correction."""
-        correction = {name: getattr(self, name) for name in CORRECTIONS}
-        source = {f"{_SOURCE}{name}": tensor for name, tensor in self.source.state().items()}
-        return correction | source
 
     @classmethod
     def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> Self:
@@ -120,7 +110,7 @@ def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     field = corrected(finished.field, sequence, mapped, voxel)
     seconds = time.perf_counter() - start
     record = {**finished.record, "correction": voxel, "correction_seconds": seconds}
-    record["map_bytes"] = sum(tensor.nbytes for tensor in field.state().values())
+    record["map_bytes"] = sum(tensor.nbytes for tensor in field.state_dict().values())
     record["seconds"] += seconds
     record["misfit_m"] = usual_depth_residual(field, sequence, mapped)
     return replace(finished, field=field, record=record)

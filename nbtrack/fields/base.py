@@ -89,12 +89,8 @@ class Field(nn.Module, abc.ABC):
 
     @classmethod
     def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> "Field":
-        """The field of a map file, from what `state` returned and the record of its `Map`."""
+        """The field of a map file, from its `state_dict` and the record of its `Map`."""
         raise NotImplementedError(f"{cls.__name__} is kept in no map file")
-
-    def state(self) -> State:
-        """All learnt tensors by name, for a map file."""
-        return self.state_dict()
 
     def diagnostics(self) -> dict[str, float]:
         """Scalars, by name, that are recorded during mapping in addition to the losses."""

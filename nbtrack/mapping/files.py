@@ -160,5 +160,5 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
 
 
 def _tensors(mapped: Field) -> dict[str, Tensor]:
-    """The tensors of a field's state by name, contiguous and on the CPU."""
-    return {name: part.detach().cpu().contiguous() for name, part in mapped.state().items()}
+    """The tensors of a field's `state_dict`, contiguous and on the CPU."""
+    return {name: part.cpu().contiguous() for name, part in mapped.state_dict().items()}
