@@ -8,7 +8,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+import warnings
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
@@ -23,6 +25,7 @@ from tiny import tiny_words
 from nbtrack.cli import main
 from nbtrack.experiments.jobs import Execution, Job, Report, run_jobs
 from nbtrack.machinery.errors import DataError
+from nbtrack.machinery.files import locked
 
 _MAIN = os.getpid()  # of this process, also in workers, which are forked
 # Dask's own threads and sockets warn as they are torn down.
@@ -192,6 +195,24 @@ def test_no_scheduler(address: str, capsys, monkeypatch, tmp_path: Path) -> None
     monkeypatch.setattr("nbtrack.experiments.workers._SECONDS_TO_CONNECT", 0.5)
     assert tables(tmp_path, "--dask", address) == 2
     assert f"no Dask scheduler at {address!r}" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_another_process_is_waited_for_in_silence(tmp_path: Path, capsys) -> None:
+    """Catches work that is done beside the one who holds its lock, and a warning of waiting."""
+    done = []
+
+    def work() -> None:
+        with locked(tmp_path / "a.lock"):
+            done.append("second")
+
+    other = threading.Thread(target=work)
+    with warnings.catch_warnings(action="error"), locked(tmp_path / "a.lock"):
+        other.start()
+        other.join(0.3)
+        done.append("first")
+    other.join()
+    assert done == ["first", "second"]
+    assert capsys.readouterr() == ("", "")
 
 
 # To the whole group, as a terminal does; a shell's background jobs ignore it.

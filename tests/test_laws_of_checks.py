@@ -126,6 +126,28 @@ def test_a_cause_is_named() -> None:
     assert not replace(usual, numbers={"depth_error_per_m": (0.06, 0.05, 0.07)}).is_significant
 
 
+LIMITS = {
+    "late": (0.3, 10.0), "focal_share": (0.01, 0.5), "depth_share": (0.01, 0.5),
+    "depth_error_per_m": (5e-4, 0.05), "depth_offset": (0.02, 0.5), "right": (0.005, 0.25),
+    "down": (0.005, 0.25), "aspect": (0.01, 0.3), "y": (0.02, 1.0), "turn_z": (1.0, 30.0),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("key", LIMITS)
+def test_what_is_negligible_and_what_a_fit_may_find(key: str, sign: int) -> None:
+    """Catches another limit of a number, one in one direction alone, and an estimate at the end of
+    what is tried that counts as found."""
+    negligible, limit = LIMITS[key]
+
+    def is_told(value: float, nearest: float) -> bool:
+        numbers = {key: (sign * value, *sorted([sign * nearest, sign * 2 * limit]))}
+        return Misfit("a cause", READING, numbers, 0.001, 0.5).is_significant
+
+    assert [is_told(value, 1.01 * negligible) for value in (0.99 * limit, limit)] == [True, False]
+    assert not is_told(0.99 * limit, 0.99 * negligible)
+
+
 def test_which_convention_is_the_best() -> None:
     """Catches one that is taken although it is hardly better, meets too little, lies far apart or
     has absurd depths; of those that fit alike the first counts."""
