@@ -80,6 +80,21 @@ def test_near_measurements_count_more(monkeypatch) -> None:
     assert field(seen_by_both)[1].mean().item() == pytest.approx(0.006 / 17, rel=0.2)
 
 
+def test_before_and_behind_a_wall_alike(monkeypatch) -> None:
+    """Catches offsets of equations that lie more on one side of a surface: a wall halfway between
+    vertices, of a map that has 0.6 of the distance, is corrected in mirror images."""
+    monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 20_000)
+    depths_mm = np.full((1, 48, 64), 2000.0)
+    frames = sequence_of(depths_mm, Intrinsics.from_focal(64, 48, 48.0))
+    flat = Formula(lambda points: 0.6 * (2.0 - points[:, 2]), BOX)
+    field = corrected(flat, frames, np.arange(1), 0.1)
+    across = torch.tensor([[0.1, 0.05, 2.0 + s] for s in (-0.13, -0.08, -0.03, 0.03, 0.08, 0.13)])
+    *_, distance, confidence = field.channels(across)
+    torch.testing.assert_close(distance, -distance.flip(0), rtol=0, atol=1e-4)
+    torch.testing.assert_close(confidence, confidence.flip(0), rtol=0, atol=2e-3)
+    torch.testing.assert_close(distance[2:4], torch.tensor([0.03, -0.03]), rtol=0, atol=1e-3)
+
+
 @pytest.mark.parametrize("factor", [1.0, 3.0])
 def test_the_start_of_the_network_by_hand(factor: float) -> None:
     """Catches frequencies that are drawn per unit of the map and not per metre, another scale of
