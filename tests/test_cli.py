@@ -6,7 +6,6 @@ And what is printed while they run and no bar is shown: a line every 30 seconds.
 import json
 import shutil
 import signal
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,11 +19,10 @@ from scipy.spatial.transform import Rotation
 from test_faults import assert_refused
 from tiny import tiny_words
 
-from nbtrack import load_preset, open_scene, read_map
 from nbtrack.cli import COMMANDS, main
 from nbtrack.experiments.map_jobs import MapJob
 from nbtrack.machinery.errors import DataError
-from nbtrack.machinery.files import naming_damaged, runs_folder
+from nbtrack.machinery.files import naming_damaged
 from nbtrack.machinery.progress import ProgressBar
 from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.recording import open_recording
@@ -181,24 +179,6 @@ def test_help_is_true_for_its_command(capsys) -> None:
     assert ("in runs/" in said["tables"], "in runs/" in said["data check"]) == (True, False)
     assert ("default: corrected" in said["track"], "corrected" in said["tables"]) == (True, False)
     assert "synthetic (default)" in said["bench"]
-
-
-def test_the_home_folder_is_meant_by_its_sign(tmp_path: Path, monkeypatch) -> None:
-    """Catches a folder called `~` where a shell leaves it as it is, after `=` and in variables."""
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("NBTRACK_RUNS", "~/runs")
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.chdir(tmp_path)
-    made = ["data", "make", "living_room", "--out=~/room", "--n-frames=2", "--width=16"]
-    assert main(made) == 0
-    assert (tmp_path / "room" / "poses.txt").is_file()
-    assert open_scene("~/room", load_preset("smoke")).folder == (tmp_path / "room").resolve()
-    assert runs_folder() == (tmp_path / "runs").resolve()
-    (tmp_path / "own_nothing.py").write_text("")
-    mapped = ["map", "~/room", "--field", "points", "--out=~/map", "--import=~/own_nothing.py"]
-    assert main(mapped) == 0
-    assert read_map("~/map").field.name == "points"
-    assert not (tmp_path / "~").exists()
 
 
 @pytest.fixture

@@ -83,12 +83,6 @@ def _killed(kind: str, finished: str, checkpoint: str, content) -> Callable[[], 
     return leave
 
 
-def _cache_in_a_loop_of_links() -> None:
-    Path("one").symlink_to("other")
-    Path("other").symlink_to("one")
-    os.environ["NBTRACK_RUNS"] = "one"
-
-
 # Settings in files; more kinds in test_settings.py.
 TOML = {
     "binary": (b"\x00\xff\xfe", "readable TOML"),
@@ -109,7 +103,6 @@ KILLED_MAP = "maps", "map.safetensors", "mapping.pt"
 KILLED_RUN = "tracks", "metrics.json", "run.pt"
 # Results that were spoilt. What a map file may hold instead of a map: test_map_files.py.
 FILES = {
-    "cache in a loop": (_cache_in_a_loop_of_links, OWN, "symbolic links"),
     "no map": (_nothing, [*GIVEN, "nowhere"], "nowhere holds no finished map"),
     "a run for a map": (_nothing, [*GIVEN, "run"], "run holds no finished"),
     "another file for a map": (_nothing, [*GIVEN, RUN], "map again, and give"),
@@ -180,15 +173,3 @@ def test_a_disk_that_fills_up_while_results_are_written(n_bytes: int, work: Path
         for command, place in commands:
             assert os.strerror(errno.EFBIG) in assert_refused(work, capsys, command, place)
     assert json.loads((work / "run/metrics.json").read_text())["frames"] == 5
-
-
-@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP])
-def test_a_file_system_without_locks(code: int, work: Path, monkeypatch) -> None:
-    """Catches "No locks available", which no user can mend, in place of a room, a map and a run."""
-
-    def no_lock(descriptor: int, operation: int) -> None:
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr("fcntl.flock", no_lock)
-    assert main([*OWN, "--frames", "1:", "--out", "elsewhere"]) == 0
-    assert Path("elsewhere/metrics.json").is_file()

@@ -8,7 +8,6 @@ from box_room import BoxRoom, box_sequence, narrow_room, walk
 from nbtrack.beyond.lm import LmSettings
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import Frame
-from nbtrack.machinery.errors import DataError
 from nbtrack.tracking import StepBudget, make_tracker
 
 SETTINGS = LmSettings(n_restarts=2)
@@ -104,14 +103,3 @@ def test_memory_may_be_used_again() -> None:
     tracker = make_tracker("sdf", BoxRoom(), np.eye(4), StepBudget(1))
     tracker.track(sequence[1]).T_world_camera[:] = np.nan
     assert np.isfinite(tracker.track(sequence[1]).T_world_camera).all()
-
-
-def test_masked_depth() -> None:
-    """Catches masked depth that is taken for measured."""
-    color, depth = np.zeros((12, 16, 3), np.uint8), np.full((12, 16), 1500, np.uint16)
-    masked = np.ma.masked_array(depth, np.arange(192).reshape(12, 16) < 16)
-    frame = Frame.of_images(CAMERA_OF_BUFFERS, color, masked)
-    assert (frame.depth_mm[0] == 0).all()
-    assert (frame.depth_mm[1:] == 1500).all()
-    with pytest.raises(DataError, match="masked"):
-        Frame.of_images(CAMERA_OF_BUFFERS, np.ma.masked_equal(color, 0), depth)

@@ -3,7 +3,6 @@
 And keys follow the code: what changes a result changes its key, what does not leaves it alone.
 """
 
-import importlib.util
 import os
 import shutil
 import subprocess
@@ -11,7 +10,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from test_faults import assert_refused
 from test_own_method import OWN
 from tiny import TINY
 
@@ -40,26 +38,6 @@ def test_folders(elsewhere: Path) -> None:
     assert files.runs_folder() == elsewhere / "runs"
     assert files.data_folder() == elsewhere / "data"
     assert files.tables_folder() == elsewhere / "paper_tables"
-
-
-EXTRAS = [
-    ("distributed", ["tables", "--dask", "tcp://h:1"], "pip install 'nbtrack[cluster]'"),
-    ("small_gicp", ["track", "office", "--field", "points", "--tracker", "icp", "--steps", "1"],
-     "pip install 'nbtrack[icp]'"),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("missing", "arguments", "message"), EXTRAS)
-def test_a_missing_extra_is_told_before_any_work(
-    elsewhere: Path, missing: str, arguments: list[str], message: str, monkeypatch, capsys
-) -> None:
-    """Catches minutes of work that end in a traceback of imports."""
-    found = importlib.util.find_spec
-    monkeypatch.setattr(
-        "importlib.util.find_spec", lambda name, *a: None if name == missing else found(name, *a)
-    )
-    assert_refused(elsewhere, capsys, arguments, message)
-    assert not list(elsewhere.iterdir())
 
 
 def test_help_is_quick_and_needs_no_torch(tmp_path: Path) -> None:

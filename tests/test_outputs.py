@@ -22,11 +22,10 @@ from recordings import N_FRAMES, write_recording
 from test_faults import assert_refused, contents
 from tiny import tiny_words
 
-from nbtrack import load_preset, track_scenes
+from nbtrack import load_preset
 from nbtrack.cli import main
-from nbtrack.experiments.scenes import Scene, open_scene, open_scenes
+from nbtrack.experiments.scenes import Scene, open_scene
 from nbtrack.machinery import files
-from nbtrack.machinery.device import threads
 from nbtrack.machinery.errors import DataError
 from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.reading import read_frames
@@ -185,18 +184,6 @@ def test_flagged_and_wrong_frames_are_told_apart(work: Path, capsys) -> None:
     assert "tracker itself" not in capsys.readouterr().out
 
 
-def test_threads_belong_to_a_run_by_the_clock_and_its_key(work: Path) -> None:
-    """Catches seconds a frame of two threads that are given out as those of one."""
-    preset = load_preset(settings=[*SET[1::2], "scenes.names=['living_room']"])
-    scenes = open_scenes(preset)
-    found = []
-    for n_threads in (1, 2):
-        with threads(n_threads):
-            found.append(track_scenes(scenes, ["sdf"], preset, [30], clock=True))
-    assert [runs["threads"][0] for runs in found] == [1, 2]
-    assert found[0]["run"][0] != found[1]["run"][0]
-
-
 def test_far_from_the_origin(tmp_path: Path, capsys) -> None:
     """Catches positions in map coordinates that single precision rounds to half a metre, and one
     pose that is far from all others."""
@@ -241,11 +228,3 @@ def test_shared_frames_are_those_read_anew(format: str, tmp_path: Path) -> None:
         assert (some.depths_mm == whole.depths_mm[ids]).all()
     whole, part = (read_frames(recording, slice(first, None, 2)) for first in (1, 3))
     assert np.shares_memory(whole.colors, part.colors)
-
-
-def test_without_rerun(finished: Path, monkeypatch, capsys) -> None:
-    """Catches a traceback of imports, or minutes of meshing before it is told."""
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    monkeypatch.setattr("nbtrack.experiments.exports.extract_mesh", None)
-    command = ["export", str(finished / "run"), "--to", "rrd", str(finished / "run.rrd")]
-    assert_refused(finished, capsys, command, "pip install 'nbtrack[rerun]'")

@@ -2,7 +2,6 @@
 
 import io
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import matplotlib
@@ -20,7 +19,6 @@ from PIL import Image, ImageSequence
 from nbtrack import plots
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics
-from nbtrack.experiments.runs import save_picture
 from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.idea import plot_idea
 from nbtrack.plots.movie import view_of
@@ -177,18 +175,6 @@ def test_the_zero_level_lies_on_the_sphere(sequence, field, height, up) -> None:
     along = Formula(lambda points: points @ torch.tensor(up, dtype=torch.float32), CUBE)
     values = plots.plot_slice(along, held(sequence, up), height).axes[0].collections[0].get_array()
     assert values.mean() == pytest.approx(height, abs=1e-4)
-
-
-def test_names_that_are_no_formulas(tmp_path: Path) -> None:
-    """Catches a picture that fails, after all the work, for a dollar sign in a recording's name or
-    a user's wish for TeX, and warnings of letters that a font lacks."""
-    for settings in ({}, {"text.usetex": True}):
-        with matplotlib.rc_context(settings):
-            figure = plots.plot_curves(SWEEP, *SWEEP, "a$^$b 録画: 3 frames")
-            save_picture(figure, tmp_path / "picture.png")
-    _, described = figure._repr_mimebundle_()
-    assert described["image/png"]["alt"] == "a$^$b 録画: 3 frames"
-    assert (tmp_path / "picture.png").stat().st_size > 1000
 
 
 def test_what_was_not_seen_is_veiled(sequence) -> None:

@@ -85,30 +85,6 @@ def test_draw_covers_only_the_given_frames() -> None:
     assert len(torch.unique(both, dim=0)) == 2 * 16 * 12
 
 
-@pytest.mark.parametrize("name", ["meta", pytest.param("cuda", marks=pytest.mark.gpu)])
-def test_images_stay_on_the_host_where_the_device_is_full(name: str, monkeypatch) -> None:
-    """Catches a long sequence that is copied to a small device: images stay, as 5 bytes a pixel;
-    on a GPU also other draws, or rays left behind."""
-    if name == "cuda" and not torch.cuda.is_available():
-        pytest.skip("needs a GPU besides the host")
-    device, asked, drawn = torch.device(name), [], []
-    for has_room in (False, True):
-        monkeypatch.setattr(
-            "nbtrack.data.pixels.has_room_for",
-            lambda *question, answer=has_room: asked.append(question) or answer,
-        )
-        sampler = PixelSampler(random_sequence(3), device)
-        images = {sampler.colors.device.type, sampler.depths_mm.device.type}
-        assert images == {name if has_room else "cpu"}
-        assert sampler.T_world_camera.device.type == name
-        if name == "cuda":
-            generator = torch.Generator(device).manual_seed(0)
-            drawn.append(sampler.draw(100, generator, torch.arange(3, device=device)))
-            assert drawn[-1].color.device.type == drawn[-1].depth.device.type == name
-            torch.testing.assert_close(drawn[0].depth, drawn[-1].depth, rtol=0, atol=0)
-    assert asked == 2 * [(device, 5 * 3 * CAMERA.width * CAMERA.height)]
-
-
 def test_guided_depths(generator: torch.Generator) -> None:
     """Catches samples behind the surface's band, too few in a part of it or right behind the
     surface, an unsorted ray, a missing depth taken for a surface at the camera (such rays go to the

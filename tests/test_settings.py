@@ -12,7 +12,7 @@ import pytest
 from box_room import BoxRoom, walk
 from tiny import TINY
 
-from nbtrack import METHODS, Field, claim, load_preset, make_tracker, open_scenes
+from nbtrack import METHODS, Field, load_preset, make_tracker, open_scenes
 from nbtrack.beyond.correction import correct_map
 from nbtrack.beyond.points import PointMapping
 from nbtrack.data.dataset import DATASET_SCENES
@@ -218,21 +218,3 @@ def test_every_key_at_its_limits(key: str, small: Preset) -> None:
     for text in TRIED[kind]:
         with contextlib.suppress(NbtrackError, OSError):  # which users are told in a line
             use(with_settings(small, f"{key}={text}"), key)
-
-
-def test_claims_of_results(capsys) -> None:
-    """Catches a claim that stops a reader who changed a setting, and one that is never checked."""
-    changed = load_preset(settings=["mapping.imap.iterations=300"])
-    claim(changed, True, "it is sharp")
-    assert capsys.readouterr().out == "it is sharp\n"
-    for preset in (changed, PRESETS["paper"]):
-        with pytest.warns(UserWarning, match="it is sharp"):
-            claim(preset, False, "it is sharp")
-    with pytest.raises(AssertionError, match="it is sharp"):
-        claim(load_preset(), False, "it is sharp")
-    own = ["scenes.motion=handheld", "mapping.imap.iterations=600"]  # of the notebook itself
-    with pytest.raises(AssertionError, match="it is sharp"):
-        claim(load_preset(settings=own), False, "it is sharp", own)
-    other = load_preset(settings=[*own, "mapping.imap.iterations=300"])
-    with pytest.warns(UserWarning, match="it is sharp"):
-        claim(other, False, "it is sharp", own)
