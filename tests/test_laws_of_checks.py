@@ -127,7 +127,7 @@ def test_a_cause_is_named() -> None:
 
 
 LIMITS = {
-    "late": (0.3, 10.0), "focal_share": (0.01, 0.5), "depth_share": (0.01, 0.5),
+    "late": (0.3, 10.0), "focal_share": (0.01, 0.5), "depth_share": (0.01, 0.8),
     "depth_error_per_m": (5e-4, 0.05), "depth_offset": (0.02, 0.5), "right": (0.005, 0.25),
     "down": (0.005, 0.25), "aspect": (0.01, 0.3), "y": (0.02, 1.0), "turn_z": (1.0, 30.0),
 }  # fmt: skip
