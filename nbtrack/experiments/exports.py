@@ -1,6 +1,5 @@
 """Export runs and maps in other forms: pictures, movies, meshes, lists of poses."""
 
-import importlib.util
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +12,10 @@ from nbtrack.beyond.points import PointCloud
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments import runs
 from nbtrack.experiments.track_jobs import TrackJob
-from nbtrack.machinery.errors import ConfigError, DataError, MissingError, look_up
+from nbtrack.machinery.errors import ConfigError, DataError, look_up
 from nbtrack.machinery.files import naming_damaged, write_atomic
 from nbtrack.machinery.progress import ProgressBar
+from nbtrack.machinery.registry import from_extra
 from nbtrack.mapping.files import MESH_FILE, Map, read_map
 from nbtrack.plots import cloud_of, movie_bytes, movie_pictures, plot_overview
 from nbtrack.plots.meshes import extract_mesh, mesh_bytes
@@ -123,8 +123,8 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
 
     The recording and the map must lie where they lay when the run was made.
     """
-    if format_name == "rrd" and importlib.util.find_spec("rerun") is None:
-        raise MissingError("--to rrd needs Rerun: pip install 'nbtrack[rerun]'")
+    if format_name == "rrd":  # before any work
+        from_extra("rerun", "rerun")
     tracked = runs.read_trajectory(source)
     metrics, n_frames = tracked.metrics, len(tracked.frames)
     stored, _ = _map_of(tracked)

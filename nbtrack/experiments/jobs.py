@@ -5,7 +5,6 @@ other in this process, or side by side in other processes or on a Dask cluster. 
 nothing from a second thread, so it is the jobs that share the cores of a machine.
 """
 
-import importlib.util
 import json
 import os
 import pickle
@@ -24,9 +23,10 @@ from nbtrack.experiments.runs import check_no_recording
 from nbtrack.experiments.workers import DEATHS, Workplace, cluster, processes
 from nbtrack.fields import FIELDS
 from nbtrack.machinery import device
-from nbtrack.machinery.errors import ConfigError, MissingError, NbtrackError
+from nbtrack.machinery.errors import ConfigError, NbtrackError
 from nbtrack.machinery.files import data_folder, locked, runs_folder, write_atomic
 from nbtrack.machinery.progress import ProgressBar
+from nbtrack.machinery.registry import from_extra
 from nbtrack.recordings.images import images_of
 from nbtrack.tracking import TRACKERS
 
@@ -99,8 +99,8 @@ class Execution:
 
     def __post_init__(self) -> None:
         """Raises MissingError, before any work, if Dask is needed and not there."""
-        if self.dask is not None and not importlib.util.find_spec("distributed"):
-            raise MissingError("--dask needs Dask: pip install 'nbtrack[cluster]', or --workers")
+        if self.dask is not None:
+            from_extra("distributed", "cluster")
 
 
 def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[Any]:

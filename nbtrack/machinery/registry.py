@@ -12,6 +12,7 @@ import traceback
 from collections import UserDict
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import TypeVar
 
 from nbtrack.machinery.errors import ConfigError, MissingError
@@ -70,6 +71,14 @@ class Registry(UserDict[str, Entry]):
                 raise ConfigError(f"{name!r} cannot be loaded from {entry} ({error})") from error
             self[name] = entry
         return entry
+
+
+def from_extra(package: str, extra: str) -> ModuleType:
+    """An optional package. Raises MissingError if it is not there, or is broken."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise MissingError(f"{error}: pip install 'nbtrack[{extra}]'") from error
 
 
 def import_own(source: str) -> None:

@@ -10,6 +10,7 @@ from nbtrack.data.dataset import DATASET_SCENES, DATASET_ZIP
 from nbtrack.machinery.errors import DataError, MissingError, look_up
 from nbtrack.machinery.files import absolute, naming_damaged, write_atomic
 from nbtrack.machinery.progress import ProgressBar
+from nbtrack.machinery.registry import from_extra
 
 # The paths that are written below a scene's folder: what nbtrack reads of a scene. Any other path,
 # as with `..`, could lead out of the folder.
@@ -52,11 +53,7 @@ def _archive(source: str, opened: contextlib.ExitStack) -> zipfile.ZipFile:
         if not path.is_file():
             raise MissingError(f"no file {path}: give --url an http(s) address or a ZIP file")
         return zipfile.ZipFile(path)
-    try:
-        import remotezip  # an extra
-        import requests
-    except ImportError:
-        raise MissingError("data fetch needs remotezip: pip install 'nbtrack[fetch]'") from None
+    remotezip, requests = (from_extra(name, "fetch") for name in ("remotezip", "requests"))
     session = opened.enter_context(requests.Session())  # one connection for all files
     try:
         return remotezip.RemoteZip(source, session=session, timeout=60)  # s without an answer

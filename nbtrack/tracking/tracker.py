@@ -1,7 +1,6 @@
 """The base class of trackers, which take frame after frame and estimate the camera's poses."""
 
 import abc
-import importlib.util
 import time
 from copy import copy, deepcopy
 from dataclasses import dataclass, field
@@ -14,9 +13,10 @@ from nbtrack.core.arrays import Pose, Poses, Scalar, Transform, Transforms
 from nbtrack.data.frame import Frame
 from nbtrack.fields import FIELDS, Field, LearnedField
 from nbtrack.machinery.device import suited_to, synchronize, usual_modes
-from nbtrack.machinery.errors import ConfigError, MissingError, NumericalError, typed
+from nbtrack.machinery.errors import ConfigError, NumericalError, typed
 from nbtrack.machinery.inputs import checked_pose, whole_number
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
+from nbtrack.machinery.registry import from_extra
 from nbtrack.machinery.settings import checked, one_of
 from nbtrack.tracking.budget import Budget
 from nbtrack.tracking.reach import Reach
@@ -118,8 +118,8 @@ class Tracker(abc.ABC):
             named = getattr(kind, "name", kind.__name__)
             known = ", ".join(name for name, other in FIELDS.items() if cls.works_in(other))
             raise ConfigError(f"{cls.name!r} does not work on field {named!r}: take {known}")
-        if cls.package and importlib.util.find_spec(cls.package) is None:
-            raise MissingError(f"tracker {cls.name} needs more: pip install 'nbtrack[{cls.name}]'")
+        if cls.package:
+            from_extra(cls.package, cls.name)
 
     def prepare(self, field: Field) -> Field:
         """The field in the form, and on the device, in which this tracker uses it."""
