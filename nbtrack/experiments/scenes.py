@@ -79,14 +79,11 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     Raises ConfigError if there is no such folder, room or scene, and MissingError if the scene of
     the dataset was not downloaded.
     """
-    text = str(sequence)
-    folder = absolute(sequence)
-    # The name of a room or scene also wins over a plain file.
-    is_name = text in _KNOWN and (folder.is_file() or is_own_output(folder))
-    # Any other plain file becomes a scene whose opening raises an error that says what to give.
-    if (folder.is_dir() or folder.is_file()) and not is_name:
-        if text in _KNOWN:
-            tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
+    text, folder = str(sequence), absolute(sequence)
+    if text not in _KNOWN and folder.exists():
+        return Scene(folder.name, folder, format)  # of a plain file: its opening says what to give
+    if folder.is_dir() and not is_own_output(folder):
+        tell(f"{text}: the folder {folder} is read, not the room or scene of that name")
         return Scene(folder.name, folder, format)
     if text in ROOMS:
         return _room(text, preset.scenes)
