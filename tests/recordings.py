@@ -284,15 +284,10 @@ def write_polycam(folder: Path, data: Source) -> None:
 
 
 WRITERS: dict[str, Callable[[Path, Source], None]] = {
-    "neural_rgbd": write_neural_rgbd,
-    "tum": write_tum,
-    "replica": write_replica,
-    "7scenes": write_seven_scenes,
-    "scannet": write_scannet,
-    "plain": write_plain,
-    "record3d": write_record3d,
-    "polycam": write_polycam,
-}
+    "neural_rgbd": write_neural_rgbd, "tum": write_tum, "replica": write_replica,
+    "7scenes": write_seven_scenes, "scannet": write_scannet, "plain": write_plain,
+    "record3d": write_record3d, "polycam": write_polycam,
+}  # fmt: skip
 
 
 def write_recording(format: str, folder: Path, data: Source | None = None) -> Path:

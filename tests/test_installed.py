@@ -49,11 +49,7 @@ def test_help_is_quick_and_needs_no_torch(tmp_path: Path) -> None:
     assert "--map-from" in done.stdout
 
 
-FEW = [
-    "mapping.fading.iterations=6",
-    "mapping.fading.n_rays=8",
-    "scenes.names=['office','bedroom']",
-]
+FEW = ["mapping.fading.iterations=6", "mapping.fading.n_rays=8"]
 SCRIPT = f"""{OWN}
 from nbtrack.experiments.grid import Execution
 preset = nbtrack.load_preset(settings={[*TINY, *FEW, "scenes.names=['office','bedroom']"]!r})
