@@ -1,6 +1,6 @@
 """What the checks conclude from numbers, at their limits, by hand."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from unittest import mock
 
@@ -124,6 +124,12 @@ def test_a_cause_is_named() -> None:
         assert one.is_significant is is_significant
     assert not replace(large, cost_left=0.8).is_significant
     assert not replace(usual, numbers={"depth_error_per_m": (0.06, 0.05, 0.07)}).is_significant
+
+
+def test_a_corrected_camera_by_hand() -> None:
+    """Catches a sign, a share of the other side, and an aspect without the common factor."""
+    changed = replace(READING, focal_share=0.1, aspect=0.2, right=0.1, down=-0.1).calibration
+    assert astuple(changed) == pytest.approx((64, 48, 52.8, 63.36, 38.4, 19.2))
 
 
 LIMITS = {
