@@ -31,7 +31,9 @@ def assert_refused(work: Path, capsys, command: list[str], says: str) -> str:
     capsys.readouterr()
     assert main(command) == 2
     lines = capsys.readouterr().err.splitlines()
-    (error,) = [line for line in lines if not line.startswith("nbtrack: warning: ")]
+    (error,) = [
+        line for line in lines if not line.startswith(("nbtrack: warning: ", "nbtrack: note: "))
+    ]
     assert error.startswith("nbtrack: "), error
     assert says in error
     assert contents(work) == before
