@@ -83,7 +83,7 @@ def plot_pose_losses(
     panels = new_axes(title.replace("-", "−"), 2.9, 1, 2)[0]  # minus signs for hyphens
     tangent_cm = np.array([-5, 0, 5])  # offsets along x of three points on the tangent
     for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
-        axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
+        axes.plot(straight[name], color=color, alpha=0.4, label="pale: not turned")
         axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
         axes.plot(turned[name].idxmin(), turned[name].min(), "v", color="0.3", label="lowest")
         loss = np.interp(x_cm, turned.index, turned[name])
@@ -110,7 +110,7 @@ def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
         axes.plot(curves[name], color=color)
         axes.plot(best_cm, curves[name][best_cm], "o", color="0.3", label=label)
         axes.axvline(0, label="the true pose", **DASHED)
-        axes.set(xlabel="camera off along x (cm)", ylabel=name)
+        axes.set(xlabel="camera off along x (cm)", ylabel=name, ylim=0)
         axes.legend()
     return panels[0].figure
 

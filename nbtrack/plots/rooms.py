@@ -124,7 +124,7 @@ def plot_map_and_slice(
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    left, middle, right = new_axes(title, 3.2, 1, 3, width_ratios=[1.5, 1.5, 1.0])[0]
+    left, middle, right = new_axes(title, 3.2, 1, 3, width_ratios=[1, 1, 1.3])[0]
     left.figure.get_layout_engine().set(wspace=0.08)
     middle.sharex(left)
     middle.sharey(left)
