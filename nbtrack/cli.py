@@ -6,6 +6,7 @@ import os
 import re
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Sequence
 from functools import partial
@@ -167,7 +168,12 @@ def _imported(module: str) -> Any:
 
     Nothing is begun then, and libraries that are interrupted go on, or raise other errors.
     """
-    before = signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # Only the main thread may set a handler. None is one that is not Python's, and stays.
+    is_main = threading.current_thread() is threading.main_thread()
+    before = signal.getsignal(signal.SIGINT) if is_main else None
+    if before is None:
+        return importlib.import_module(f"nbtrack.experiments.{module}")
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
         return importlib.import_module(f"nbtrack.experiments.{module}")
     finally:
