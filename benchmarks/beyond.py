@@ -1,6 +1,6 @@
 """The larger results that notebook 6 reads: CSV files in paper_tables/beyond.
 
-    python benchmarks/beyond.py [convergence]
+    python benchmarks/beyond.py [convergence|units]
 
 They are of the two rooms of the preset `smoke`, with the paper's numbers of steps, and take an hour
 on one CPU core. Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed run
@@ -19,7 +19,7 @@ from motions import HAND_HELD
 
 from nbtrack import METHODS, Method, load_preset, make_tracker, open_scenes, track_scenes
 from nbtrack.experiments.grid import Execution
-from nbtrack.experiments.methods import RATES_3_HZ, TABLE_3
+from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.presets import Preset
 from nbtrack.experiments.quality import score_map
 from nbtrack.experiments.scenes import Scene
@@ -101,10 +101,23 @@ def convergence(scene: Scene, preset: Preset) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
+def units(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
+    """VR and SDF at 10 Hz with learning rates in metres, and in units of the map: longer steps."""
+    runs = []
+    for unit in ("metre", "map"):
+        rates = [f"tracking.{name}.position_unit={unit}" for name in TABLE_1]
+        trials = track_scenes(scenes, TABLE_1, with_settings(preset, *rates), [10], frames=":")
+        runs.append(trials.assign(position_unit=unit))
+    kept = [name for name in _COLUMNS if name != "seconds_per_frame"]
+    return pd.concat(runs)[["position_unit", *kept, "reach_m", "greedy_ate_m"]]
+
+
 if __name__ == "__main__":
     smoke = load_preset("smoke", settings=HAND_HELD)
     rooms = open_scenes(smoke)
     if sys.argv[1:] == ["convergence"]:
         write("convergence", convergence(rooms[0], smoke))
+    elif sys.argv[1:] == ["units"]:
+        write("units", units(rooms, smoke))
     else:
         beyond(rooms, smoke)
