@@ -226,7 +226,11 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     if unknown:
         given = unknown[0].partition("=")[0]
         known = [name for name in options.parser._option_string_actions if name.startswith("--")]
-        takers = [name for name, (_, words) in COMMANDS.items() if given in words.split()]
+        takers = [
+            name
+            for name, (_, words) in COMMANDS.items()
+            if given in [word.partition(":")[0] for word in words.split()]
+        ]
         hint = f"only for {', '.join(takers)}" if takers else nearest_name(given, known)
         options.parser.error(f"unknown argument {unknown[0]!r}: {hint}")
     return options

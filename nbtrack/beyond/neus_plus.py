@@ -92,12 +92,12 @@ def distance_targets(
 
     - The tangent plane of the ray's pixel: the distance is (D - d) times the length of the ray's
       direction times the cosine of incidence. It is exact if the surface is flat, and its noise
-      averages out. It is used if no other surface is nearer, in front of the surface and up to
-      10 cm behind it. Behind the surface it is not used where a camera saw through the sample,
-      since thin things end there.
-    - The distance `nearest`. It is used in front of the surface if another surface is nearer or the
-      plane is unknown, but only farther than `surface_band` from the surface: there it is right to
-      millimetres (see `ObservedDistance`).
+      averages out. It is used in front of the ray's surface, and up to 10 cm behind it, where it
+      agrees with `nearest` to `_PLANE_TOLERANCE`. Behind the surface it is not used where a camera
+      saw through the sample, since thin things end there.
+    - The distance `nearest`. It is used elsewhere in front of the ray's surface, if this surface is
+      more than `surface_band` (m of z-depth) away. Within a voxel of another surface it may be up
+      to half a voxel too large, since it is interpolated.
 
     Farther behind the surface nothing is known.
 

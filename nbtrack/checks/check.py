@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from nbtrack.checks import findings
 from nbtrack.checks.conventions import MIN_OVERLAP, Convention, fit_all
-from nbtrack.checks.misfits import CAUSES, Misfit, fit, main_misfits
+from nbtrack.checks.misfits import Misfit, fit_causes, main_misfits
 from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.data.sequence import ARRAYS, RgbdSequence
@@ -113,18 +113,18 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     conventions, best = fit_all(frame_pairs, as_declared)
     cloud = _cloud(as_declared, sequence)
     is_far = cloud.depth > far_limit(cloud.depth)
-    # A misfit is told only of what is read rightly otherwise, and a small one of many frames only.
-    declared_is_best = best is conventions[0]
+    # Causes are fitted only if the declared convention is the best and leaves a gap to explain.
+    # With few frames the gap must be large.
+    is_best = best is conventions[0]  # the declared one
+    has_gap = best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
     has_enough = len(ids) >= _MIN_FRAMES or conventions[0].is_far_apart
-    has_enough &= best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
-    causes = ProgressBar("fitting", CAUSES.items() if declared_is_best and has_enough else [])
-    misfits = [fit(frame_pairs, as_declared, as_declared, name, keys) for name, keys in causes]
+    misfits = fit_causes(frame_pairs, as_declared) if is_best and has_gap and has_enough else []
     main = main_misfits(frame_pairs, as_declared, misfits)
     step_m = findings.steps_of(frames, cloud.depth, recording.declared.depth_scale)
     misread = findings.misreading(conventions[0], best, main, step_m)  # a sentence by its kind
     faults = [*findings.of_images(frames, no_depth, counts[0]), *misread.get("fault", [])]
     doubts, remarks = misread.get("doubt", []), misread.get("note", [])
-    if declared_is_best:  # otherwise the numbers of poses and depths mean nothing
+    if is_best:  # otherwise the numbers of poses and depths mean nothing
         faults += findings.of_poses(frames, recording) if "fault" not in misread else []
         faults += findings.of_units(cloud.depth[~is_far])
         remarks += findings.of_depths(cloud.depth)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from nbtrack.checks.readings import AREA_SCALE, FramePairs, Gaps, Reading, cost_of, mean_apart
+from nbtrack.machinery.progress import ProgressBar
 
 _STEPS = 12  # of Gauss-Newton, at most
 _STARTS = np.linspace(-0.9, 0.9, 8)  # of a fit of one number, beside the declared one
@@ -128,14 +129,20 @@ def main_misfits(pairs: FramePairs, as_declared: Reading, misfits: list[Misfit])
         return []
     lowest = min(misfit.cost_left for misfit in significant)
     first, *others = (m for m in significant if _ALIKE * m.cost_left <= lowest)
-    all_numbers = fit(pairs, as_declared, first.reading, "all", list(_NUMBERS))
+    all_numbers = fit(pairs, as_declared, "all", list(_NUMBERS), start=first.reading)
     if all_numbers.cost_left < min(_WHOLE * lowest, lowest - _CLEARLY):
         return []
     return [first, *(other for other in others if not first.numbers.keys() <= other.numbers.keys())]
 
 
+def fit_causes(pairs: FramePairs, as_declared: Reading) -> list[Misfit]:
+    """Fit each of `CAUSES` alone, from the numbers as declared."""
+    causes = ProgressBar("fitting", CAUSES.items())
+    return [fit(pairs, as_declared, name, keys, start=as_declared) for name, keys in causes]
+
+
 def fit(
-    pairs: FramePairs, as_declared: Reading, start: Reading, name: str, keys: list[str]
+    pairs: FramePairs, as_declared: Reading, name: str, keys: list[str], start: Reading
 ) -> Misfit:
     """Fit the numbers `keys` of the cause `name`, while all others stay as declared.
 

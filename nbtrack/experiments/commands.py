@@ -160,7 +160,7 @@ def _warn(metrics: dict[str, Any]) -> None:
         tell(f"nbtrack: warning: {metrics['map_warning']}")
     outside = metrics.get("outside_map_share", 0.0)
     if outside > 0:
-        tell(f"nbtrack: warning: {outside:.0%} of the frames saw little of what was mapped")
+        tell(f"nbtrack: warning: {outside:.1%} of the frames saw little of what was mapped")
 
 
 def _opened(options: Namespace, preset: Preset) -> Scene:

@@ -55,6 +55,7 @@ class Registry(UserDict[str, Entry]):
         self._entries = entries
 
     def __copy__(self) -> "Registry":
+        """A registry with the same entries: `mock.patch.dict` copies what it restores."""
         return Registry({**self.data})
 
     def __getitem__(self, name: str) -> Entry:
@@ -73,12 +74,13 @@ class Registry(UserDict[str, Entry]):
         return entry
 
 
-def from_extra(package: str, extra: str) -> ModuleType:
-    """An optional package. Raises MissingError if it is not there, or is broken."""
+def from_extra(package: str, extra: str = "") -> ModuleType:
+    """An optional package, of an extra of nbtrack. Raises MissingError if it cannot be imported."""
     try:
         return importlib.import_module(package)
-    except ImportError as error:
-        raise MissingError(f"{error}: pip install 'nbtrack[{extra}]'") from error
+    except Exception as error:  # a package that is broken may raise any
+        wanted = f"'nbtrack[{extra}]'" if extra else package
+        raise MissingError(f"{error}: pip install {wanted}") from error
 
 
 def import_own(source: str) -> None:

@@ -55,7 +55,10 @@ def depth_residual_of(field: Field, frame: Frame) -> float:
 
 
 def usual_depth_residual(field: Field, sequence: RgbdSequence, mapped: Frames) -> float:
-    """The median `depth_residual_of` (m) over ten mapped frames, evenly spread; 0 without depth."""
+    """The median `depth_residual_of` (m) over ten mapped frames, evenly spread.
+
+    It is 0 if none of them has depth: then the least allowance of `check_belongs` applies.
+    """
     spread = np.linspace(0, len(mapped) - 1, min(_MISFIT_FRAMES, len(mapped))).round().astype(int)
     frames = [sequence[index] for index in mapped[spread].tolist()]
     residuals = [depth_residual_of(field, frame) for frame in frames if frame.has_depth]

@@ -19,9 +19,10 @@ from nbtrack.plots.scene import draw_slice
 from nbtrack.plots.style import WIDTH, method_colors, new_axes, styled
 
 _STEP = 0.01  # m, between the grid points of the slice
-# How far (m) the figure reaches: on the near side of the camera, beyond the measured point, and to
-# either side of the ray.
-_BEFORE, _BEHIND, _ASIDE = 0.2, 0.45, 0.45
+# How far (m) the figure reaches: behind the camera, beyond the measured point, and to either side
+# of the ray.
+_BEHIND_CAMERA, _BEYOND, _ASIDE = 0.2, 0.45, 0.45
+_PANELS_SHARE = 0.82  # of the figure's width; labels and the colour bar have the rest
 _N_STRATIFIED, _N_IMPORTANCE = 32, 12  # iMAP's numbers of samples along a ray
 _DOT = {"edgecolors": "black", "linewidths": 0.5, "zorder": 4}
 _HALO = withStroke(linewidth=3, foreground="white")
@@ -48,13 +49,15 @@ def plot_idea(
     """
     points_camera, point_camera = _points_of_row(frame, *pixel)
     distance = point_camera.norm().item()
-    x = np.arange(max(-_BEFORE, distance - before), distance + _BEHIND, _STEP)
-    texts = 1.15 if any(T_world_camera) else 1.1  # inches; more if a panel has a title
-    height = texts + 0.82 * WIDTH / len(T_world_camera) * 2 * _ASIDE / (x[-1] - x[0])
+    x = np.arange(max(-_BEHIND_CAMERA, distance - before), distance + _BEYOND, _STEP)
+    text_height = 1.15 if any(T_world_camera) else 1.1  # inches; more if a panel has a title
+    panel_width = _PANELS_SHARE * WIDTH / len(T_world_camera)
+    height = text_height + panel_width * 2 * _ASIDE / (x[-1] - x[0])
     panels = new_axes(title, height, 1, len(T_world_camera), sharey=True)[0]
     page_camera = _page_camera(point_camera / distance)
     places = np.stack(np.meshgrid(x, np.arange(-_ASIDE, _ASIDE + _STEP, _STEP)), axis=-1)
-    norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # those of the first, for all
+    bar = {"ax": panels, "aspect": 25, "pad": 0.015}
+    norm = None  # the first slice makes the colour scale and its bar; the others take the scale
     for axes, (name, T) in zip(panels, T_world_camera.items(), strict=True):
         grid_world = places @ page_camera.numpy() @ T[:3, :3].T + T[:3, 3]
         norm = draw_slice(axes, field, grid_world, places, norm=norm, **bar)
@@ -75,7 +78,7 @@ def _points_of_row(frame: Frame, row: int, column: int) -> tuple[Tensor, Tensor]
     This one is the measured pixel nearest to (row, column); the row is that of this pixel.
     """
     pixels = frame.measured_pixels()
-    away = (pixels - torch.tensor([[row], [column]])).abs().sum(dim=0)
+    away = (pixels - pixels.new_tensor([[row], [column]])).abs().sum(dim=0)
     row, column = pixels[:, away.argmin()]
     in_row = pixels[:, pixels[0] == row]
     points_camera, _ = frame.points(*in_row)

@@ -29,9 +29,10 @@ class Part:
 
 
 def _smooth_noise(points: Points, wavelength: float, seed: int) -> Values:
-    """A smooth random value at each point, about in [-1, 1]: a sum of five sines.
+    """A smooth random value at each point, in [-2, 2] with a standard deviation of about 0.6.
 
-    The sines have random directions and phases, and wavelengths of 1 to 2.4 times `wavelength` (m).
+    It is the sum of five sines, divided by 2.5. They have random directions and phases, and
+    wavelengths of 1 to 2.4 times `wavelength` (m).
     """
     rng = np.random.default_rng(seed)
     vectors = rng.normal(size=(5, 3))

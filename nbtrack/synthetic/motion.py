@@ -54,11 +54,11 @@ def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
 def attempts(room: Room, seed: int) -> Iterator[np.random.Generator]:
     """Yields random generators for up to 400 paths; the caller stops at the first path it accepts.
 
-    Raises NumericalError after the last one: the room is too full for a path with `CLEARANCE`.
+    Raises NumericalError after the last one, most often since the room is too full.
     """
     for attempt in range(400):
         yield np.random.default_rng([seed, attempt, room.number])
-    found = f"room '{room.name}': no path keeps {CLEARANCE} m from surfaces"
+    found = f"room '{room.name}': no random path is clear by {CLEARANCE} m and within all limits"
     raise NumericalError(f"{found}; move its walk or furniture")
 
 
@@ -149,7 +149,8 @@ def tour(room: Room, n_frames: int, seed: int) -> Poses:
     steps = np.linalg.norm(np.diff(around, axis=0, append=around[:1]), axis=1)
     round_length = steps.sum()  # m
     # A spline of x and z over the metres walked. The walk is repeated three times and all frames
-    # lie in the second round, so that neither interpolation nor smoothing comes near an end.
+    # lie in the second round. So interpolation never comes near an end, and smoothing (4 times 45
+    # frames to either side) only if there are fewer than 180 frames.
     curve = CubicSpline(_exclusive_cumsum(np.tile(steps, 3)), np.tile(around, (3, 1)))
     speed = _relative_speed(n_frames, rng)
     walked = round_length * (1 + _exclusive_cumsum(speed) / speed.sum())  # m, at each frame

@@ -119,7 +119,7 @@ class Tracker(abc.ABC):
             known = ", ".join(name for name, other in FIELDS.items() if cls.works_in(other))
             raise ConfigError(f"{cls.name!r} does not work on field {named!r}: take {known}")
         if cls.package:
-            from_extra(cls.package, cls.name)
+            from_extra(cls.package)
 
     def prepare(self, field: Field) -> Field:
         """The field in the form, and on the device, in which this tracker uses it."""
