@@ -174,7 +174,7 @@ def draw_errors(axes: Axes, frames: Mapping[str, pd.DataFrame]) -> None:
         axes.plot(frames[label]["frame_id"], error_cm, color=color, label=label)
     still = list(frames.values())[-1]  # the same in every run of these frames
     axes.plot(still["frame_id"], 100 * still["still_error_m"], label=STANDING_STILL, **style.DOTTED)
-    axes.set_ylabel("translation error (cm)")
+    axes.set_ylabel("position error (cm)")
     style.log_axes(axes, "y")
 
 
