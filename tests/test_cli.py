@@ -4,8 +4,11 @@ And what is printed while they run and no bar is shown: a line every 30 seconds.
 """
 
 import json
+import os
 import shutil
 import signal
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -179,6 +182,16 @@ def test_help_is_true_for_its_command(capsys) -> None:
     assert ("in runs/" in said["tables"], "in runs/" in said["data check"]) == (True, False)
     assert ("default: corrected" in said["track"], "corrected" in said["tables"]) == (True, False)
     assert "synthetic (default)" in said["bench"]
+
+
+def test_a_pipe_that_nobody_reads() -> None:
+    """Catches a traceback, or a message about the output, where its reader has left."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "nbtrack", "methods"]
+    found = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert (found.returncode, found.stderr) == (1, "")
 
 
 @pytest.fixture

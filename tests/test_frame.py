@@ -8,6 +8,7 @@ from box_room import BoxRoom, box_sequence, narrow_room, walk
 from nbtrack.beyond.lm import LmSettings
 from nbtrack.core.camera import Intrinsics
 from nbtrack.data.frame import Frame
+from nbtrack.machinery.errors import DataError
 from nbtrack.tracking import StepBudget, make_tracker
 
 SETTINGS = LmSettings(n_restarts=2)
@@ -82,6 +83,26 @@ def test_a_spoilt_frame_is_survived_and_flagged(case: str) -> None:
             assert estimate.lost or error_m(estimate.T_world_camera, sequence, index) < LOST
     assert not estimate.lost
     assert error_m(estimate.T_world_camera, sequence, index) < 0.01
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("depth", [None, [[1.0]], torch.ones(12, 16)])
+def test_images_that_are_none(depth: object) -> None:
+    """Catches a traceback for what a camera's driver returns when it has no image, where types are
+    not checked at each call."""
+    with pytest.raises(DataError, match=f"depth is {type(depth).__name__}: give a num"):
+        Frame.of_images(CAMERA_OF_BUFFERS, np.zeros((12, 16, 3), np.uint8), depth)
+
+
+def test_masked_depth() -> None:
+    """Catches masked depth that is taken for measured, and masked colours taken for seen."""
+    color, depth = np.zeros((12, 16, 3), np.uint8), np.full((12, 16), 1500, np.uint16)
+    masked = np.ma.masked_array(depth, np.arange(192).reshape(12, 16) < 16)
+    frame = Frame.of_images(CAMERA_OF_BUFFERS, color, masked)
+    assert (frame.depth_mm[0] == 0).all()
+    assert (frame.depth_mm[1:] == 1500).all()
+    with pytest.raises(DataError, match="masked"):
+        Frame.of_images(CAMERA_OF_BUFFERS, np.ma.masked_equal(color, 0), depth)
 
 
 def test_memory_may_be_used_again() -> None:

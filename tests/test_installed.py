@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from test_faults import assert_refused
 from test_own_method import OWN
 from tiny import TINY
 
@@ -38,6 +39,23 @@ def test_folders(elsewhere: Path) -> None:
     assert files.runs_folder() == elsewhere / "runs"
     assert files.data_folder() == elsewhere / "data"
     assert files.tables_folder() == elsewhere / "paper_tables"
+
+
+ICP = ["track", "office", "--field", "points", "--tracker", "icp", "--steps", "1"]
+EXTRAS = [
+    ("distributed", ["tables", "--dask", "tcp://h:1"], "pip install 'nbtrack[cluster]'"),
+    ("small_gicp", ICP, "pip install small_gicp"),
+]
+
+
+@pytest.mark.parametrize(("package", "arguments", "says"), EXTRAS)
+def test_a_missing_extra_is_told_before_any_work(
+    elsewhere: Path, package: str, arguments: list[str], says: str, monkeypatch, capsys
+) -> None:
+    """Catches minutes of work that end in a traceback of imports."""
+    monkeypatch.setitem(sys.modules, package, None)
+    assert_refused(elsewhere, capsys, arguments, says)
+    assert not list(elsewhere.iterdir())
 
 
 def test_help_is_quick_and_needs_no_torch(tmp_path: Path) -> None:

@@ -224,6 +224,17 @@ def test_a_coarse_stage_that_leads_astray_is_undone() -> None:
     np.testing.assert_array_equal(optimizer.T_world_camera, ORIGIN)
 
 
+def test_what_is_no_number_stays_none() -> None:
+    """Catches compiled sums that turn NaN into a pose, and reads outside of the grid."""
+    grid = grid_of(ROOM)
+    problem = Problem(Observed(POINTS, LUMAS, NONE), grid, FINE, 1.0, ORIGIN)
+    terms = residual_terms(problem, np.full((4, 4), np.nan))
+    cost = robust_cost(terms.residuals, terms.reliability, grid.accuracy.residual_sigma, 1.0)
+    assert np.isnan(cost) or not terms.reliability.any()
+    sums = normal_equations(terms, grid.accuracy.residual_sigma, 1.0)
+    assert np.isnan(sums[0]).any() or not terms.reliability.any()
+
+
 def test_points_are_drawn_away_from_borders_and_edges() -> None:
     """Catches points whose depth may belong to either side of an edge, and draws that do not follow
     the seed."""

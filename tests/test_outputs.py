@@ -216,6 +216,17 @@ def test_far_from_the_origin(tmp_path: Path, capsys) -> None:
     assert_refused(tmp_path, capsys, command, "frame 2 is no rigid transform")
 
 
+def test_a_link_in_the_way_is_not_followed(tmp_path: Path) -> None:
+    """Catches a file of the user's that is overwritten through a link with a name to be guessed."""
+    (tmp_path / "victim").write_text("precious")
+    for name in (f".result.txt.{os.getpid()}.tmp", "result.txt"):
+        (tmp_path / name).symlink_to(tmp_path / "victim")
+    files.write_atomic(tmp_path / "result.txt", "new")
+    assert (tmp_path / "victim").read_text() == "precious"
+    assert (tmp_path / "result.txt").read_text() == "new"
+    assert not (tmp_path / "result.txt").is_symlink()
+
+
 @pytest.mark.parametrize("format", ["neural_rgbd", "tum"])  # depth in mm, and in another unit
 def test_shared_frames_are_those_read_anew(format: str, tmp_path: Path) -> None:
     """Catches frames that change places where others were read before, and copies of what a slice

@@ -20,7 +20,7 @@ from nbtrack import load_preset, provenance
 from nbtrack.beyond.correction import correct_map
 from nbtrack.cli import main
 from nbtrack.experiments.methods import METHODS, method_of
-from nbtrack.fields import FIELDS, NeusMapping
+from nbtrack.fields import FIELDS, NeusMapping, field_class
 from nbtrack.machinery import registry
 from nbtrack.machinery.errors import ConfigError
 from nbtrack.machinery.files import runs_folder
@@ -270,3 +270,13 @@ def test_what_the_doors_load(tmp_path: Path) -> None:
     command = [sys.executable, "-c", DOORS, str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.stdout, done.stderr) == (f"{corrected.key}\n", "")
+
+
+def test_an_entry_as_a_text(monkeypatch) -> None:
+    """Catches a class of a user's that cannot be named as entry points are, and a traceback where
+    the name is wrong."""
+    monkeypatch.setitem(FIELDS, "neus", "nbtrack.fields.neus:NeuSField")
+    assert field_class("neus").name == "neus"
+    monkeypatch.setitem(FIELDS, "neus", "nbtrack.fields.neus:NeusField")
+    with pytest.raises(ConfigError, match="'neus' cannot be loaded from nbtrack"):
+        field_class("neus")

@@ -85,6 +85,20 @@ def test_draw_covers_only_the_given_frames() -> None:
     assert len(torch.unique(both, dim=0)) == 2 * 16 * 12
 
 
+@pytest.mark.parametrize("has_room", [False, True])
+def test_images_stay_on_the_host_where_the_device_is_full(has_room: bool, monkeypatch) -> None:
+    """Catches a long sequence that is copied to a small device: images stay, as 5 bytes a pixel."""
+    asked, device = [], torch.device("meta")
+    monkeypatch.setattr(
+        "nbtrack.data.pixels.has_room_for", lambda *question: asked.append(question) or has_room
+    )
+    sampler = PixelSampler(random_sequence(3), device)
+    images = {sampler.colors.device.type, sampler.depths_mm.device.type}
+    assert images == {"meta" if has_room else "cpu"}
+    assert sampler.T_world_camera.device == device
+    assert asked == [(device, 5 * 3 * CAMERA.width * CAMERA.height)]
+
+
 def test_guided_depths(generator: torch.Generator) -> None:
     """Catches samples behind the surface's band, too few in a part of it or right behind the
     surface, an unsorted ray, a missing depth taken for a surface at the camera (such rays go to the

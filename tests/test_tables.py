@@ -1,6 +1,8 @@
 """Both tables: every published cell with its mark-up, the rules on data of our own, the files."""
 
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pandas as pd
@@ -8,7 +10,7 @@ import pytest
 
 from nbtrack import tables
 from nbtrack.experiments.runs import over_rooms, shares
-from nbtrack.latex import latex_file
+from nbtrack.latex import Wording, latex_file
 from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.tables import style_table_1, style_table_2, table_1, table_2, write_tables
 
@@ -237,6 +239,20 @@ def test_written_files(tmp_path: Path) -> None:
     assert "C, $n = 512$ &" in third.read_text()
 
 
+CAPTIONS = pd.read_csv(Path(__file__).parent / "data/captions.csv")
+
+
+@pytest.mark.parametrize(("given", "written"), CAPTIONS.to_numpy())
+def test_captions_compile(tmp_path: Path, given: str, written: str) -> None:
+    """Catches a caption or label that ends a line, a cell or TeX, and LaTeX that is spoiled."""
+    own = Wording(given, "tab:a_b%c#1")
+    first, *_ = write_tables(tmp_path, OURS_1, OURS_2, NOTE, wording=own)
+    text = first.with_suffix(".tex").read_text()
+    assert rf"\caption{{{written} \textcolor{{red}}" in text
+    assert r"\label{tab:a_b-c-1}" in text
+    assert r"\label{tab:a_b-c-1-steps}" in (tmp_path / "table_2.tex").read_text()
+
+
 def test_millimetres_where_metres_tie(tmp_path: Path) -> None:
     """Catches rows that tie in metres, marks that follow another unit than the digits, a caption
     that names the wrong one, a mark that black and white printing loses, and n named twice."""
@@ -284,6 +300,29 @@ def test_cells_of_no_table() -> None:
             make(pd.concat([cells, cells]))
         with pytest.raises(DataError, match="it needs"):
             make(pd.DataFrame())
+
+
+def latex_is_installed() -> bool:
+    files = ["booktabs.sty", "geometry.sty", "multirow.sty", "siunitx.sty", "xcolor.sty"]
+    if shutil.which("pdflatex") is None or shutil.which("kpsewhich") is None:
+        return False
+    return subprocess.run(["kpsewhich", *files], capture_output=True).returncode == 0
+
+
+@pytest.mark.skipif(not latex_is_installed(), reason="no LaTeX with the packages needed")
+def test_tables_compile(tmp_path: Path) -> None:
+    """Catches a table that needs more than its comment says: the document there is compiled."""
+    paths = write_tables(tmp_path, SEEDS, OURS_2.assign(steps_std=0.5), NOTE)
+    paths += tables.write_table_1(tmp_path / "9", PUBLISHED_1.assign(still_ate_m=0.5), NOTE)
+    for path in (p for p in paths if p.suffix == ".tex"):
+        comments = re.findall(r"^%   (.*)$", path.read_text(), re.MULTILINE)
+        assert comments[0].startswith(r"\documentclass")
+        (path.parent / "document.tex").write_text("\n".join(comments) + "\n")
+        command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "document.tex"]
+        done = subprocess.run(command, cwd=path.parent, capture_output=True, timeout=60)
+        output = done.stdout.decode(errors="replace")
+        assert done.returncode == 0, output[-2000:]
+        assert "Overfull" not in output
 
 
 def test_names_are_text_on_a_page_and_in_latex(tmp_path: Path) -> None:
