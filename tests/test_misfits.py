@@ -82,6 +82,10 @@ def halfway(data):
     return data._replace(poses=poses)
 
 
+def in_steps(data):
+    return camera(0.95)(depth(lambda d: d // 50 * 50)(data))
+
+
 def of_disparity(depths: np.ndarray) -> np.ndarray:
     return np.where(depths > 0, 1.7e6 / np.maximum(depths, 100), 0)
 
@@ -102,6 +106,7 @@ CASES = {
     "two poses and a half late": (halfway, "depth comes after", 2.5, 0.3),
     "positions of another scale": (positions(lambda t: 0.4 * t), "depths should change", -60, 1),
     "steps of 10 cm": (depth(lambda d: d // 100 * 100), "depths come in steps of", 10, 0),
+    "focal, in steps": (in_steps, "focal lengths should", 5.26, 0.7),
     "disparity": (depth(of_disparity), UNTOLD, 0, 0),
     "poses drifting by 50 cm": (positions(drifting), UNTOLD, 0, 0),
 }  # fmt: skip

@@ -256,6 +256,16 @@ def moving(times: np.ndarray) -> np.ndarray:
     return poses_at(positions, np.outer(times, [0.3, 0.9, -0.2]))
 
 
+@pytest.mark.parametrize(("step", "pose_step"), [(80, 4), (80, 1), (4, 10)])
+def test_lists_of_one_clock_have_one_unit(plain: Path, step: int, pose_step: int) -> None:
+    """Catches ms of fast poses that are read as s, and frame numbers of sparse ones as ms."""
+    times, stamps = step * np.arange(N_FRAMES), np.arange(0, 5 * step + 1, pose_step)
+    (plain / "timestamps.txt").write_text(matrix_text(times[:, None]))
+    (plain / "trajectory.txt").write_text(tum_lines(stamps, moving(stamps / 1e3)))
+    has_pose, T = np.isin(times, stamps), open_recording(plain).T_world_camera
+    np.testing.assert_allclose(T[has_pose], moving(times / 1e3)[has_pose], atol=1e-6)
+
+
 @pytest.mark.parametrize("direction", ["camera-to-world", "world-to-camera"])
 def test_poses_between_stamps_are_interpolated(tmp_path: Path, direction: str) -> None:
     """Catches the nearest pose of a slow list for images between two, which is millimetres off;

@@ -20,6 +20,8 @@ _OFF = 0.05  # m
 _OFF_STEPS = 2.5  # medians of the distance between frames
 _MIN_REPEATED = 0.05  # a larger share of frames that repeat the depth of the one before is a fault
 _MAX_STEP = 0.01  # share of the depth: coarser steps of a camera's depth are remarked (our choice)
+# Surfaces of right recordings in coarse steps lie 0.13 to 0.19 of a step apart.
+_OF_STEP = 0.2
 # A depth value is no measurement if it is a larger share of all depths than SHARED, if it is that
 # in a larger share of the frames than _SHARING, and if it is more than _SPIKE times as frequent as
 # any other value (our choice).
@@ -36,14 +38,14 @@ def misreading(
     `best` is from `fit_all`, and `main` from `main_misfits`. It is empty if nothing is wrong.
     - Another convention is the best, or a cause explains the gaps, which then are those of right
       recordings: a "note" if usual sensors have such an error, else a "fault".
-    - Depths come in steps (m; 0: none), and the gaps are below half a step: a "doubt", or a "note"
-      if they are those of right recordings.
+    - Depths come in steps (m; 0: none), which explain the gaps: a "doubt", or a "note" if these are
+      those of right recordings.
     - Surfaces lie apart without a known cause: a "doubt", or a "fault" if they lie far apart.
     """
     depth_mm = 1e3 * declared.depth_m
     usual_mm = declared.usual_apart * depth_mm
     apart = f"lie {declared.apart * depth_mm:.0f} mm apart" if declared.overlap else "never meet"
-    if best is declared and declared.apart * depth_mm < 1e3 * step_m / 2:
+    if best is declared and declared.apart * depth_mm < _OF_STEP * 1e3 * step_m:
         advice = "use the camera's own depth files, or expect no better poses"
         text = f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
         return {"note" if declared.apart <= declared.usual_apart else "doubt": [text]}
@@ -59,9 +61,9 @@ def misreading(
             f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
             "and nothing that is tried explains it: no other axes, units or directions of poses "
             "and depth, no late depth, no focal lengths or principal point, no error of depth (a "
-            "factor, a length, a square), no offset of the camera. What cannot be told: poses that "
-            "drift or jump, a lens's distortion, and depth images that hold no depth (disparity, "
-            "half floats, each frame scaled by itself)"
+            "factor of 0.2 to 1.8, a length, a square), no offset of the camera. What cannot be "
+            "told: poses that drift, jump or have a scale of their own, a lens's distortion, and "
+            "depth images that hold no depth (disparity, half floats, each frame scaled by itself)"
         )
         return {"fault" if declared.is_far_apart else "doubt": [text]}
     else:

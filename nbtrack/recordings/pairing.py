@@ -59,6 +59,18 @@ def nearest(times: Times, others: Times, tolerance: float) -> Frames:
     return np.where(distances <= tolerance, closest, -1)
 
 
+def _in_unit_of(times: Times, stamps: Times) -> Times:
+    """Stamps (s) of the same clock as some times (s), in whose unit `in_seconds` may have erred.
+
+    It takes each list by itself, so that it reads a fast or sparse count as one of another unit.
+    """
+    for scale in (1.0, 1e-3, 1e-6, 1e-9, 1e3, 1e6, 1e9):
+        n_near = (nearest(times, scale * stamps, _TOLERANCE) >= 0).sum()
+        if n_near > max(1, min(len(times), len(stamps)) / 2):
+            return scale * stamps
+    return stamps
+
+
 def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Path], Times, str]:
     """Pair the images of one list with the depth maps of another by their times.
 
@@ -68,6 +80,7 @@ def pair_lists(color_list: Path, depth_list: Path) -> tuple[list[Path], list[Pat
     """
     color_times, colors = _read_list(color_list)
     depth_times, depths = _read_list(depth_list)
+    depth_times = _in_unit_of(color_times, depth_times)
     depth_of_color = nearest(color_times, depth_times, _TOLERANCE)
     color_of_depth = nearest(depth_times, color_times, _TOLERANCE)
     # An image without a depth map has the index -1, which is the last depth map's in this line. The
@@ -153,6 +166,8 @@ class Moments:
         """
         has_both = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
         known_poses, known_stamps = poses[has_both], stamps[has_both]
+        if self.recorded_times is not None:
+            known_stamps = _in_unit_of(self.recorded_times, known_stamps)
         same_time = nearest(self.times, known_stamps, tolerance=0.0)
         if len(known_stamps) > 0 and (same_time >= 0).sum() == len(known_stamps):  # rule 1
             return _at(known_poses, same_time), ""
