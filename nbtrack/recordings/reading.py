@@ -99,7 +99,8 @@ def select_frames(recording: Recording, frames: Any, needs_poses: bool = True) -
         found += f", and {len(frame_ids)} of these have a pose"
     if not len(frame_ids):
         add = f"add poses ({recording.pose_file or ' or '.join(recording.format.poses)})"
-        raise DataError(f"{found}: choose others, {add}, or track with --map-from, without poses")
+        choose = "choose others (--frames, or scenes.track_frames for tables)"
+        raise DataError(f"{found}: {choose}, {add}, or track with --map-from, without poses")
     return frame_ids
 
 
