@@ -318,12 +318,8 @@ def test_what_could_not_be_read_is_not_written(case: str, tmp_path: Path, monkey
 def test_frames_are_lost_by_one_rule() -> None:
     """Catches a frame without depth that is lost as an estimate, and neither lost nor found in
     the table."""
-
-    class Mine(type(tracker())):
-        def report(self) -> dict[str, bool]:
-            return {"lost": False}
-
     seen = replace(SEQUENCE, depths_mm=SEQUENCE.depths_mm.copy())
     seen.depths_mm[2] = 0
-    mine = Mine(BoxRoom(), np.eye(4), StepBudget(2), SdfSettings(n_pixels=16))
+    mine = tracker()
+    mine.report = lambda: {"lost": False}
     assert track_sequence(mine, seen).frames["lost"].tolist() == [False, True, False]

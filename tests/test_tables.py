@@ -304,9 +304,10 @@ def test_cells_of_no_table() -> None:
 
 def latex_is_installed() -> bool:
     files = ["booktabs.sty", "geometry.sty", "multirow.sty", "siunitx.sty", "xcolor.sty"]
-    if shutil.which("pdflatex") is None or shutil.which("kpsewhich") is None:
-        return False
-    return subprocess.run(["kpsewhich", *files], capture_output=True).returncode == 0
+    has_programs = shutil.which("pdflatex") and shutil.which("kpsewhich")
+    return (
+        has_programs and not subprocess.run(["kpsewhich", *files], capture_output=True).returncode
+    )
 
 
 @pytest.mark.skipif(not latex_is_installed(), reason="no LaTeX with the packages needed")
