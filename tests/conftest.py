@@ -56,6 +56,14 @@ def unchecked(monkeypatch) -> None:
 
 
 @pytest.fixture
+def generator():
+    """Random numbers of torch that are the same in every run."""
+    import torch
+
+    return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
 def plain(tmp_path: Path) -> Path:
     """A recording as a plain folder."""
     from recordings import write_recording

@@ -16,7 +16,6 @@ from recordings import CAMERA, N_FRAMES, WRITERS, Source, matrix_text, source, w
 from nbtrack.cli import main
 from nbtrack.core.camera import Intrinsics
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError
-from nbtrack.recordings.formats import FORMATS
 from nbtrack.recordings.images import images_of
 from nbtrack.recordings.reading import parse_frames, read_frames, read_sequence, select_frames
 from nbtrack.recordings.recording import open_recording
@@ -260,14 +259,6 @@ def test_formats_are_told_apart(plain: Path, tmp_path: Path) -> None:
         read_sequence(plain, format="replika")
     with pytest.raises(MissingError, match=r"needs the files of neural_rgbd"):
         read_sequence(tmp_path / "seven")
-
-
-def test_a_new_format_is_one_entry(plain: Path, monkeypatch) -> None:
-    """Catches formats listed anywhere but in the table."""
-    monkeypatch.setitem(FORMATS, "own", replace(FORMATS["plain"], color=("rgb/*",)))
-    (plain / "color").rename(plain / "rgb")
-    check_equal(read_sequence(plain), source())
-    assert open_recording(plain).declared.format == "own"
 
 
 def test_a_lens_by_any_name(plain: Path) -> None:

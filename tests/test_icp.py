@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -173,11 +174,7 @@ def test_a_killed_run_goes_on(room: Room, tmp_path, monkeypatch) -> None:
     such a tracker went on."""
     monkeypatch.setattr("nbtrack.machinery.files.CHECKPOINT_SECONDS", -1)
     whole = track_sequence(tracker_in(room), room[0])
-
-    def kill(index: int, error_m: float) -> None:
-        if index == 3:
-            raise KeyboardInterrupt
-
+    kill = mock.Mock(side_effect=[None, None, KeyboardInterrupt])
     with pytest.raises(KeyboardInterrupt):
         track_sequence(tracker_in(room), room[0], tmp_path / "run.pt", kill)
     resumed = track_sequence(tracker_in(room), room[0], tmp_path / "run.pt")

@@ -93,14 +93,6 @@ def test_numbers_in_prose_are_computed(request, cells) -> None:
 NUMBERED = [path for path in NOTEBOOKS if path.name.startswith("0")]
 SCENES = {"kitchen": "living_room", "whiteroom": "office"}  # what they show is a room of ours
 SIZE = 96, 72
-SETTINGS = """
-    mapping.imap.iterations=200 mapping.imap.n_rays=32 network.imap.width=32
-    mapping.neus.iterations=40 mapping.neus.n_rays=16 network.neus.width=32
-    mapping.neus_plus.iterations=20 mapping.neus_plus.n_rays=16
-    mapping.neus_plus.n_surface_points=128 scenes.track_frames=20:26
-    tracking.vr.n_pixels=16 tracking.sdf.n_pixels=64 tracking.lm.n_pixels=128
-    tables.pixels.vr=[16] tables.pixels.sdf=[64] tables.rates_hz=[10] tables.budgets_ms=[50]
-"""
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +114,7 @@ def test_every_cell_runs(notebook: Path, folder: Path, monkeypatch, capsys) -> N
     monkeypatch.setenv("NBTRACK_DATA", str(folder))
     monkeypatch.setenv("NBTRACK_RUNS", str(folder / "runs"))
     monkeypatch.setenv("NBTRACK_PRESET", "paper")
-    monkeypatch.setenv("NBTRACK_SET", SETTINGS)
+    monkeypatch.setenv("NBTRACK_CONFIG", str(Path(__file__).parent / "data/notebooks.toml"))
     monkeypatch.chdir(notebook.parent)
     shell = InteractiveShell()
     for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:

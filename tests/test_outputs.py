@@ -30,7 +30,6 @@ from nbtrack.machinery.errors import DataError
 from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.reading import read_frames
 from nbtrack.recordings.recording import open_recording
-from nbtrack.synthetic import make, room
 
 PROJECT = Path(__file__).parents[1]
 # How often each file was opened in this process, whatever module opened it.
@@ -159,15 +158,6 @@ def test_an_image_mended_in_place_counts(tmp_path: Path, kind: str) -> None:
     cv2.imwrite(str(image), pixels, uncompressed)
     shutil.copytree(tmp_path / "rec", tmp_path / "copy")
     assert Scene("rec", tmp_path / "copy").fingerprint == before
-
-
-def test_a_room_is_made_anew_where_its_maker_changes(monkeypatch) -> None:
-    """Catches runs in a room that `rooms.toml` no longer describes, and other rooms made anew."""
-    names = ("office", "living_room")
-    before = [make.room_version(name) for name in names]
-    changed = {**room._TABLES["office"], "size": [9.0, 2.5, 3.0]}
-    monkeypatch.setitem(room._TABLES, "office", changed)
-    assert [make.room_version(n) == b for n, b in zip(names, before, strict=True)] == [False, True]
 
 
 def test_flagged_and_wrong_frames_are_told_apart(work: Path, capsys) -> None:

@@ -28,19 +28,14 @@ def rename(recording: Path, colors, depths=None) -> None:
             path.with_name(name + path.suffix).write_bytes(content)
 
 
-NAMED = [
-    ("{:04}_cam0", "{:04}_cam0", RUN),
-    ("rgb8_{:04}", "depth16_{:04}_of_6", RUN),
-    ("2026-11-25_{}_8bit", "{}", (8, 9, 10, 11, 99, 100)),
-    ("{0}_1305031102.{0}75", "{0}_1305031102.{0}75", RUN),
-    ("scan_{:03}.color", "scan_{:03}.depth", (0, 3, 4, 7, 8, 9)),
-]
+NAMED = pd.read_csv(Path(__file__).parent / "data/names_of_frames.csv")
 
 
-@pytest.mark.parametrize(("color", "depth", "numbers"), NAMED)
-def test_numbers_in_names(plain: Path, color: str, depth: str, numbers: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(("color", "depth", "listed"), NAMED.to_numpy())
+def test_numbers_in_names(plain: Path, color: str, depth: str, listed: str) -> None:
     """Catches a number of the camera, the bits or the date that is taken for the frame's, and an
     image that is refused, or put in another place, for it."""
+    numbers = [*map(int, listed.split())]
     rename(plain, [color.format(i) for i in numbers], [depth.format(i) for i in numbers])
     (plain / "poses.txt").write_text(matrix_text(source().poses.reshape(-1, 16)))
     sequence = read_sequence(plain, pose_file="poses.txt")
@@ -57,10 +52,10 @@ COARSE = START + np.array([0, 0, 0, 1, 1, 1])
 REFUSED = pd.read_csv(Path(__file__).parent / "data/refused_names.csv", keep_default_na=False)
 
 
-@pytest.mark.parametrize(
-    ("colors", "depths", "says"), REFUSED.to_numpy()[:, 1:], ids=REFUSED["case"]
-)
-def test_names_that_are_refused(plain: Path, colors: str, depths: str, says: str) -> None:
+@pytest.mark.parametrize(("case", "colors", "depths", "says"), REFUSED.to_numpy())
+def test_names_that_are_refused(
+    plain: Path, case: str, colors: str, depths: str, says: str
+) -> None:
     """Catches images with their neighbours' depth where one of each is lost, two files of a number
     that shift all poses behind them, two sessions that are shuffled into one, and a recording that
     is shuffled in silence, since its names were sorted."""

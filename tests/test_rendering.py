@@ -18,11 +18,6 @@ from nbtrack.fields.rendering import (
 LN2 = math.log(2.0)
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
-
-
 def ascending_depths(n_rays: int, n_samples: int, generator: torch.Generator) -> Tensor:
     return (0.1 + torch.rand(n_rays, n_samples, generator=generator)).cumsum(dim=-1)
 

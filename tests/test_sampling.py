@@ -42,11 +42,6 @@ def rays_ahead(n_rays: int, depth) -> Rays:
     return Rays(torch.zeros(n_rays, 3), directions, torch.zeros(n_rays, 3), depth)
 
 
-@pytest.fixture
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
-
-
 def test_ray_ends_at_the_observed_point(generator: torch.Generator) -> None:
     """Catches rows for columns, the pose of another frame, a direction of length one, and signed
     16 bit: 40,000 mm must not become -25.5 m, nor 65,535 no measurement."""

@@ -317,7 +317,6 @@ def test_tables_compile(tmp_path: Path) -> None:
     paths += tables.write_table_1(tmp_path / "9", PUBLISHED_1.assign(still_ate_m=0.5), NOTE)
     for path in (p for p in paths if p.suffix == ".tex"):
         comments = re.findall(r"^%   (.*)$", path.read_text(), re.MULTILINE)
-        assert comments[0].startswith(r"\documentclass")
         (path.parent / "document.tex").write_text("\n".join(comments) + "\n")
         command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "document.tex"]
         done = subprocess.run(command, cwd=path.parent, capture_output=True, timeout=60)
