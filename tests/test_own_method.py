@@ -29,7 +29,7 @@ from nbtrack.mapping.files import MAP_FILE, write_map
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.tracking import TRACKERS, tracker_class
 
-OWN = (Path(__file__).parent / "own_method.py").read_text()
+OWN = (Path(__file__).parent / "data/own_method.py").read_text()
 
 
 @contextlib.contextmanager
