@@ -19,7 +19,7 @@ from nbtrack.machinery.files import absolute, runs_folder
 from nbtrack.machinery.progress import tell
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import make_budget
-from nbtrack.tracking.methods import Methods, find_methods
+from nbtrack.tracking.methods import Method, Methods, find_methods
 from nbtrack.tracking.trajectories import Trajectory
 
 
@@ -72,14 +72,13 @@ def track_scenes(
     metrics, ate_m (NaN if unknown), failure. Raises ConfigError, and what `run_jobs` raises.
     """
     pairs = _pairs(scenes, scenes if tracked is None else tracked)
-    rates, steps = _rates(preset.tables.rates_hz, rates_hz, steps, clock)
+    rates = _rates(preset.tables.rates_hz, rates_hz, steps, clock)
     frames = preset.scenes.track_frames if frames is None else str(frames)
     jobs, rows = [], []
     for method, seed, rate_hz, (scene, seen) in product(find_methods(methods), seeds, rates, pairs):
         tracker, with_method = method.tracker, preset.with_method(method.settings)
         settings = with_method.tracking_of(tracker)
-        n_steps = steps if rate_hz is None else None if clock else method.paper_steps(rate_hz)
-        clock_hz = rate_hz if clock else None
+        n_steps, clock_hz = _budget(method, rate_hz, steps, clock)
         make_budget(n_steps, clock_hz)  # raises for a wrong number, before anything is made
         map_job = MapJob.of(scene, method.field, with_method, seed=seed)  # makes it an int
         job = TrackJob(map_job, seen, tracker, settings, n_steps, clock_hz, frames, map_job.seed)
@@ -96,17 +95,29 @@ def _pairs(scenes: Sequence[Scene], tracked: Sequence[Scene]) -> list[tuple[Scen
     return [*zip(scenes, tracked, strict=True)]
 
 
-def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: bool) -> tuple:
-    """The rates (Hz) to track at, by default the usual ones; and the steps, as Python's numbers.
+def _rates(usual_hz: Sequence, rates_hz: Sequence | None, steps: Any, clock: bool) -> list:
+    """The rates (Hz) to track at, as Python's numbers: by default the usual ones.
 
-    The rates are [None] if steps are given instead. Raises ConfigError if steps are given together
-    with rates or with the clock.
+    With given steps there is no rate, and the list is [None]. Raises ConfigError if steps are given
+    together with rates or with the clock.
     """
-    rates = usual_hz if rates_hz is None else rates_hz
-    if steps is not None and (rates_hz is not None or clock):
+    if steps is None:
+        return np.asarray(usual_hz if rates_hz is None else rates_hz).tolist()
+    if rates_hz is not None or clock:
         raise ConfigError(f"steps={steps} beside rates_hz={rates_hz}, clock={clock}: leave one out")
-    # `tolist` turns numbers of numpy into Python's, and leaves None as it is.
-    return np.asarray(rates).tolist() if steps is None else [None], np.asarray(steps).tolist()
+    return [None]
+
+
+def _budget(method: Method, rate_hz: float | None, steps: Any, clock: bool) -> tuple[Any, Any]:
+    """The steps for each frame, and the rate (Hz) by the clock; one of the two is None.
+
+    Without given steps and by no clock, the steps are those of the paper's hardware at the rate.
+    """
+    if steps is not None:
+        return np.asarray(steps).item(), None  # a number of numpy becomes Python's
+    if clock:
+        return None, rate_hz
+    return method.paper_steps(rate_hz), None
 
 
 def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[str, Any]:

@@ -269,11 +269,14 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
     Runs with the same tracker, settings and steps share one line. It is about the run in which a
     greedy search of the same reach has the largest ATE.
     """
-    pairs = [(run, run.expected_reach()) for run in runs]
-    pairs = [pair for pair in pairs if "greedy_ate_m" in pair[1]]  # needs a known true path
-    pairs.sort(key=lambda pair: pair[1]["greedy_ate_m"])
-    # In the order of ATE, so that of equal keys the run with the largest ATE stays.
-    worst = {(run.tracker, run.settings, run.steps): (run, reach) for run, reach in pairs}
+    worst: dict[tuple, tuple[TrackJob, dict[str, float]]] = {}
+    for run in runs:
+        reach = run.expected_reach()
+        if "greedy_ate_m" not in reach:  # it needs a known true path
+            continue
+        key = run.tracker, run.settings, run.steps
+        if key not in worst or reach["greedy_ate_m"] > worst[key][1]["greedy_ate_m"]:
+            worst[key] = run, reach
     for run, reach in worst.values():
         if reach["greedy_ate_m"] <= _GREEDY_ATE and reach["beyond_reach_share"] <= _SHARE:
             continue
