@@ -67,7 +67,8 @@ class Calibration:
         # Resizing rounds sides to whole pixels, so that heights may differ by one.
         has_proportions = abs(factor * old_height - height) <= 1
         if not (has_proportions and 0 <= cx <= width and 0 <= cy <= height):
-            found = f"{image} is {width}x{height} but {self.source} is for {old_width}x{old_height}"
+            of_size = f"{old_width}x{old_height}" if self.size else "images of another size"
+            found = f"{image} is {width}x{height} but {self.source} is for {of_size}"
             advice = "images may be resized but not cropped; give their own camera, or its size"
             raise DataError(f"{found}, with cx, cy then at ({cx:.0f}, {cy:.0f}): {advice}")
         return Intrinsics(width, height, factor * self.fx, factor * self.fy, cx, cy)
