@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# A first run on a machine with an NVIDIA GPU, about seven minutes: `bash benchmarks/first_gpu_run.sh`.
+# A first run on a machine with an NVIDIA GPU, twelve minutes at most: `bash benchmarks/first_gpu_run.sh`.
 # Takes the python3 of the PATH and whatever it has, writes CSV files and a log into $OUT. Each part
 # fails alone. Without a GPU it runs through in small, which says that the script is sound.
 set -u
