@@ -21,11 +21,11 @@ _LABELS = (  # the labels that have each colour of the palette in all figures
     ("NeuS with SDF", "NeuS", "SDF", "NeuS+ with SDF (Adam)"),
     ("NeuS+ baked (LM)", "NeuS+", "LM"),
     ("NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map", "greedy"),
-    # Rates have colours that belong to no method of the same figure.
+    # Rates and sensors have colours that belong to no method of the same figure.
     ("ICP", "at 5 Hz"),
-    ("NeuS+ grid", "at 10 Hz"),
-    ("five rooms of the paper",),
-    ("nine rooms of ours", "at 2 Hz"),
+    ("NeuS+ grid", "at 10 Hz", "bias taken out"),
+    ("five rooms of the paper", "dataset's sensor"),
+    ("nine rooms of ours", "at 2 Hz", "unbiased sensor"),
 )
 _FIXED = {label: color for color, labels in zip(PALETTE, _LABELS, strict=True) for label in labels}
 # Green and red as in the paper's first figure, in tones that colour-blind readers can tell apart
