@@ -20,7 +20,7 @@ from nbtrack.fields import NetworkSettings, NeusMapping, make_field
 from nbtrack.fields.base import NEAR, rendered_losses
 from nbtrack.fields.neus import NeuSField, guided_depths
 from nbtrack.machinery.errors import DataError
-from nbtrack.mapping.holdout import depth_residual_of, usual_depth_residual
+from nbtrack.mapping.holdout import misfit_of, usual_misfit
 
 BOX = SceneBounds((-1.0, -1.0, -1.0), (1.0, 1.0, 3.0))
 
@@ -173,12 +173,12 @@ def test_how_far_a_map_is_off_by_hand() -> None:
     lie where the frames saw them, or 10 cm before or behind that."""
     poses = poses_at([[0.1, 0.05, -0.1]] * 3, [0.1, -0.3, 0.2])
     sequence = box_sequence(poses)
-    assert depth_residual_of(BoxRoom(), sequence[0]) < 0.03  # rendered: as sharp as its samples
+    assert misfit_of(BoxRoom(), sequence[0]) < 0.03  # rendered: as sharp as its samples
     for off in (-0.1, 0.1):
         grid = BakedField(BoxRoom(half=(1.0 + off, 0.8 + off, 1.2 + off)), 0.05)
-        assert depth_residual_of(grid, sequence[0]) == pytest.approx(0.1, abs=2e-3)
+        assert misfit_of(grid, sequence[0]) == pytest.approx(0.1, abs=2e-3)
     sequence.T_world_camera[0, 2, 3] += 0.5
-    assert usual_depth_residual(BoxRoom(), sequence, np.array([1, 2])) < 0.03
+    assert usual_misfit(BoxRoom(), sequence, np.array([1, 2])) < 0.03
 
 
 def test_a_picture_is_what_the_camera_sees() -> None:

@@ -29,7 +29,7 @@ from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.machinery.files import digest_of
 from nbtrack.mapping.files import MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.mapping.holdout import depth_residual_of
+from nbtrack.mapping.holdout import misfit_of
 from nbtrack.plots.meshes import mesh_bytes
 from nbtrack.recordings.pose_files import read_tum
 
@@ -173,7 +173,7 @@ def test_whether_a_map_belongs(case: str, field_name: str) -> None:
     if belongs:
         assert check_belongs(stored, frame) is None
     else:
-        assert depth_residual_of(stored.field, frame) > 0.1
+        assert misfit_of(stored.field, frame) > 0.1
         with pytest.raises(DataError, match=r"frame 2 of wall is off the map of wall by 0\.\d+ m"):
             check_belongs(stored, frame)
 
@@ -182,7 +182,7 @@ def test_a_frame_without_depth_tells_nothing() -> None:
     """Catches NaN that passes for a good fit without a word."""
     sequence = wall_sequence()
     sequence.depths_mm[:] = 0
-    assert np.isnan(depth_residual_of(finished_wall().field, sequence[0]))
+    assert np.isnan(misfit_of(finished_wall().field, sequence[0]))
     assert "frame 0 of wall has no depth" in check_belongs(finished_wall(), sequence[0])
 
 

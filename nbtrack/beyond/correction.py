@@ -26,7 +26,7 @@ from nbtrack.fields.base import State
 from nbtrack.machinery.device import usual_modes
 from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
+from nbtrack.mapping.holdout import split_holdout, usual_misfit
 
 # All our choice, tried in the two rooms for tuning.
 _N_POINTS = 300_000  # random pixels are drawn; those that show a plane are used
@@ -112,7 +112,7 @@ def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     record = {**finished.record, "correction": voxel, "correction_seconds": seconds}
     record["map_bytes"] = sum(tensor.nbytes for tensor in field.state_dict().values())
     record["seconds"] += seconds
-    record["misfit_m"] = usual_depth_residual(field, sequence, mapped)
+    record["misfit_m"] = usual_misfit(field, sequence, mapped)
     return replace(finished, field=field, record=record)
 
 

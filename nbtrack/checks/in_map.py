@@ -12,7 +12,7 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field
 from nbtrack.machinery.errors import DataError
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.holdout import depth_residual_of
+from nbtrack.mapping.holdout import misfit_of
 from nbtrack.tracking.metrics import LOST_THRESHOLD_M, pose_errors
 from nbtrack.tracking.trajectories import Trajectory
 
@@ -20,21 +20,23 @@ from nbtrack.tracking.trajectories import Trajectory
 # real recording) frames of the same room had at most 0.024 m, and of other rooms at least 0.095 m.
 _MISFIT_FACTOR = 3.0  # times the usual misfit of the map's own frames
 _MISFIT_ALLOWED = 0.05  # m
-_N_FRAMES = 40  # of a run, at most, are looked at
-_N_POINTS = 500  # of each frame, at most, are looked at
-_MOSTLY = 0.5  # a frame lies outside if a larger share of its points is outside of the map's bounds
+# `outside_map_share` looks at so many frames of a run, and so many points of a frame, at most. A
+# frame lies outside if a larger share of its points than `_MOSTLY` is outside of the map's bounds.
+_N_FRAMES = 40
+_N_POINTS = 500
+_MOSTLY = 0.5
 
 
 def check_belongs(finished: Map, frame: Frame) -> str | None:
-    """Check that a frame was seen in a map's room, in the same world frame; DataError if not.
+    """Check that a frame was seen in a map's room, and that its pose is in the map's world frame.
 
-    The misfit is the frame's depth residual at its given pose. It may be at most 5 cm, or three
-    times what is usual in the map's own frames. Returns a warning if the frame has no depth, so
-    that nothing can be told, and otherwise None.
+    Raises DataError if the map's misfit in the frame, at the given pose, is above 5 cm and above
+    three times what is usual in the map's own frames. If the frame has no depth, nothing can be
+    told: then a warning is returned. Otherwise None is returned.
     """
     name = f"the map of {finished.record['scene']}"
     usual = finished.record["misfit_m"]
-    misfit_m = depth_residual_of(finished.field, frame)
+    misfit_m = misfit_of(finished.field, frame)
     if np.isnan(misfit_m):
         return f"{frame.name} has no depth: whether {name} belongs to it cannot be told"
     allowed = max(_MISFIT_ALLOWED, _MISFIT_FACTOR * usual)
@@ -48,9 +50,10 @@ def check_belongs(finished: Map, frame: Frame) -> str | None:
 
 
 def in_world_of_map(tracked: Trajectory) -> tuple[Trajectory, bool]:
-    """Move a trajectory's true poses into the map's world, if they are in another one.
+    """Move a trajectory's true poses into the map's world, if `other_world` finds them in another.
 
-    Returns the trajectory, with errors against the moved poses, and whether it was changed.
+    Returns the trajectory, whose errors are those against the moved poses, and whether any pose was
+    moved.
     """
     T_map_world = other_world(tracked.T_estimated, tracked.T_true)
     if T_map_world is None:
@@ -65,12 +68,12 @@ def in_world_of_map(tracked: Trajectory) -> tuple[Trajectory, bool]:
 
 
 def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
-    """The rigid motion T_map_world (m) that explains a run's errors, or None if there is none.
+    """The rigid motion T_map_world (m) that moves true poses from their world into the map's.
 
-    True poses are then given in another world frame than the map's. A motion explains the errors if
-    their median was above `LOST_THRESHOLD_M`, and after the motion of the true poses is below it
-    and below a tenth of what it was (our choice). The result is also None if fewer than three
-    frames have a true pose.
+    It is None if the true poses seem to be in the map's world already, if no motion explains the
+    errors of the estimates, or if fewer than three frames have a true pose. A motion explains the
+    errors if their median is above `LOST_THRESHOLD_M` before it, and after it is below this
+    threshold and below a tenth of what it was (our choice).
     """
     is_known = np.isfinite(T_true).all(axis=(1, 2))
     if is_known.sum() < 3:
@@ -93,11 +96,11 @@ def other_world(T_estimated: Poses, T_true: Poses) -> Pose | None:
 
 
 def outside_map_share(field: Field, sequence: RgbdSequence, T_estimated: Poses) -> float:
-    """The share of a run's frames of which most points lie outside of the map's bounds.
+    """The share of a run's frames that see mostly what lies outside of the map's bounds.
 
-    Some evenly spread frames are looked at, and those without depth do not count; 0 if none is
-    left. Points are placed by the true pose of their frame if it is known, else by the estimated
-    one.
+    At most `_N_FRAMES` evenly spread frames are looked at. Frames without depth do not count; if no
+    other is left, the share is 0. Points are placed by the true pose of their frame if it is known,
+    else by the estimated one.
     """
     outside = []
     stride = math.ceil((sequence.depths_mm[0].size / _N_POINTS) ** 0.5)

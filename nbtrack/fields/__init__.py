@@ -17,12 +17,15 @@ FIELDS: Registry[type[Field]] = Registry({"imap": IMapField, "neus": NeuSField})
 
 
 def field_class(name: str) -> type[Field]:
-    """The field class of a name. ConfigError, with the most similar name, for an unknown one."""
+    """The field class of a name. Raises ConfigError, which names a similar one, if unknown."""
     return look_up_kind("field", name, FIELDS, ("name", "label"))
 
 
 @usual_modes()
 def make_field(name: str, network: NetworkSettings, bounds: SceneBounds, seed: int) -> Field:
-    """A new, seeded field inside `bounds`. ConfigError for an unknown name or a seed below 0."""
+    """A new field inside `bounds`, whose random weights `seed` determines.
+
+    Raises ConfigError for an unknown name or a seed below 0.
+    """
     generator = torch.Generator().manual_seed(whole_number("seed", seed))
     return field_class(name)(network, bounds, generator)

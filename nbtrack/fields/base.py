@@ -36,9 +36,10 @@ _RAYS_AT_ONCE = 4096  # rays of an image that are rendered together, which bound
 
 Losses = dict[str, Scalar]
 State = dict[str, Tensor]
+# A rendered image: colours in [0, 1] and z-depths (m).
 View = tuple[Float[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]
-# `PixelSampler.draw` with the frames and the generator fixed: a function of n_rays and, optionally,
-# tangent_planes.
+# A function that draws random rays of the mapped frames. It takes the number of rays and,
+# optionally, `tangent_planes`; `PixelSampler.draw` explains both.
 Draw = Callable[..., Rays]
 
 
@@ -98,12 +99,15 @@ class Field(nn.Module, abc.ABC):
 
     @property
     def width(self) -> int:
-        """Units of the widest layer. The number of threads depends on it; 0 means a single one."""
+        """The number of units of the widest layer, on which the number of threads depends.
+
+        A field without layers has the width 0, and is computed by a single thread.
+        """
         return max((len(weight) for weight in self.parameters() if weight.dim()), default=0)
 
     @property
     def device(self) -> torch.device:
-        """The device of the field's tensors; the default device if it has none."""
+        """The device of the field's tensors; PyTorch's default device if the field has none."""
         tensors = [*self.parameters(), *self.buffers(), torch.empty(0)]
         return tensors[0].device
 
@@ -176,7 +180,9 @@ class LearnedField(Field):
         colors, values = self.query_along(rays, coarse)
         with torch.no_grad():
             weights = self.weights(values, rays, coarse)
-            if weights.shape != coarse.shape:  # of sections: a sample sums those on both sides
+            if weights.shape != coarse.shape:
+                # The weights are those of sections: the weight of a sample is the sum of the
+                # weights of the two sections beside it.
                 weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
             fine = rendering.importance_depths(coarse, weights, n_importance, generator)
         fine_colors, fine_values = self.query_along(rays, fine)
@@ -211,12 +217,15 @@ class LearnedField(Field):
 
 
 def rays_end(rays: Rays, bounds: SceneBounds) -> Values:
-    """Z-depth (m) at which rays leave the scene, but at least twice `NEAR`, where samples begin."""
+    """Z-depths (m) at which rays leave the scene.
+
+    They are at least 2 x `NEAR`, so that samples, which begin at `NEAR`, ascend on every ray.
+    """
     return bounds.far_bound(rays.origins_world, rays.directions_world).clamp_min(2 * NEAR)
 
 
 def measured_mean(error: Float[Tensor, "*some"], is_measured: Float[Tensor, "*some"]) -> Scalar:
-    """The mean error over elements whose mask `is_measured` is 1, not 0; 0 if there are none."""
+    """The mean of the errors whose mask `is_measured` is 1; 0 if the mask is 0 everywhere."""
     return (error * is_measured).sum() / is_measured.sum().clamp_min(1)
 
 

@@ -67,8 +67,8 @@ class FourierMlp(nn.Module):
 
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour logits and raw values at points (m, world frame); fields give them a meaning."""
-        # On the CPU a finished network is asked in parts whose layers fit the cache: value and
-        # gradient of 16,384 points cost 273 ms instead of 369 (256 wide, one busy core).
+        # On the CPU a finished network takes the points in parts, whose layers fit the cache: value
+        # and gradient of 16,384 points cost 273 ms instead of 369 (256 wide, one busy core).
         is_whole = self.head.weight.requires_grad or points_world.is_cuda
         n_at_once = max(1, len(points_world) if is_whole else _LAYER_SIZE // self.head.in_features)
         parts = [self.head(self.features(part)) for part in points_world.split(n_at_once)]

@@ -74,7 +74,10 @@ class NeuSField(LearnedField):
         return losses | {"eikonal": self._eikonal(rays.points(depths), settings, generator)}
 
     def _eikonal(self, points_world: Tensor, settings: NeusMapping, generator: Generator) -> Scalar:
-        """Weighted mean of (|grad f| - 1)^2 at a random share of the ray samples."""
+        """The eikonal loss: lambda_eikonal times the mean of (|grad f| - 1)^2.
+
+        It is computed at a random share of the samples of rays (rays x samples x 3, m, world).
+        """
         flat = points_world.flatten(0, 1)
         n_points = max(1, round(settings.eikonal_share * len(flat)))
         chosen = torch.randint(len(flat), (n_points,), generator=generator, device=flat.device)
@@ -115,10 +118,12 @@ class NeuSField(LearnedField):
 def guided_depths(
     rays: Rays, bounds: SceneBounds, settings: NeusMapping, generator: Generator
 ) -> RaySamples:
-    """Ascending z-depths (m), stratified up to just behind the measured surface, more around it.
+    """Ascending z-depths (m) of samples, which the measured depth guides.
 
-    What lies behind a surface is unknown, so there are no samples. Rays without a measured depth
-    have samples up to the end of the scene. Our choice; NICE-SLAM and its followers do the same.
+    `n_stratified` samples lie between the camera and just behind the measured surface, and
+    `n_surface` more around it. None lies farther behind, since what is there is unknown. On rays
+    without a measured depth the end of the scene takes the place of the surface. Our choice;
+    NICE-SLAM and its followers do the same.
     """
     far_bound = base.rays_end(rays, bounds)
     is_measured = rays.depth > 0

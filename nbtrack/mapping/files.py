@@ -55,17 +55,19 @@ class Map:
 @typed
 @usual_modes()
 def write_map(path: Path | str, finished: Map) -> None:
-    """Writes a map to a file, of about 1 MB for the paper's network.
+    """Write a map to a file, of about 1 MB for the paper's network.
 
     If the path is a folder, the file is its `MAP_FILE`. The map's history is then written beside
     it, and the history and mesh of an earlier map are removed. Weights keep every bit, so that the
-    file gives the same trajectories as the map. If `read_map` could not read the file, nothing is
-    written and ConfigError or DataError is raised.
+    file gives the same trajectories as the map.
+
+    Nothing is written if `read_map` could not read the file. Then ConfigError is raised for a field
+    whose class is not registered, and DataError for a damaged field or record.
     """
     path = absolute(path)
     path = path / MAP_FILE if path.is_dir() else path
     field, bounds = finished.field, finished.field.bounds
-    # A file names its field's class, or form: only what is registered can be read again.
+    # The file holds only the name by which the field's class is registered. `read_map` looks it up.
     registered = FORMS.get(field.form) if field.form else FIELDS.get(field.name)
     if type(field) is not registered:
         raise ConfigError(f"no map file holds a {type(field).__name__}: write what it comes from")
@@ -82,14 +84,15 @@ def write_map(path: Path | str, finished: Map) -> None:
         tensors = _tensors(field)
         header["digest"] = digest_of(header, tensors)
         content = safetensors.torch.save(tensors, {_FORMAT: json.dumps(header, allow_nan=False)})
+        # Read the content as a test: this raises for what could not be read from the file either.
         if _map_of(content, path).key != finished.key:
             raise ValueError("it is read as another map")
-    contents = {path.name: content}
-    if path.name == MAP_FILE:  # a folder's other files belong to its map; None removes old ones
+    others = {}
+    if path.name == MAP_FILE:  # the folder's other files belong to the map; None removes a file
         history = finished.history.rename_axis("iteration")
         text = None if history.empty else history.to_csv().encode()
-        contents = {HISTORY_FILE: text, MESH_FILE: None, path.name: content}
-    write_together(path.parent, contents)
+        others = {HISTORY_FILE: text, MESH_FILE: None}
+    write_together(path.parent, {**others, path.name: content})
 
 
 @usual_modes()
@@ -102,7 +105,7 @@ def read_map(path: Path | str) -> Map:
     """
     path = absolute(path)
     file = path / MAP_FILE if path.is_dir() else path
-    history = path / HISTORY_FILE  # a single file has none
+    history = path / HISTORY_FILE  # below a single file there is none
     if not file.is_file():
         raise MissingError(f"{path} holds no finished map of this nbtrack: map again, or give one")
     with naming_damaged(file, "map file", _AGAIN):
@@ -115,7 +118,11 @@ def read_map(path: Path | str) -> Map:
 
 
 def _map_of(content: bytes, file: Path) -> Map:
-    """The map of a file's content. Raises ValueError, KeyError or others if it is damaged."""
+    """The map of a file's content. `file` is named in errors.
+
+    Raises ConfigError if the map's class is not registered, and ValueError, KeyError or others if
+    the content is damaged: callers turn these into one DataError by `naming_damaged`.
+    """
     tensors = safetensors.torch.load(content)
     # A safetensors file begins with the size of its JSON header, in 8 bytes, and that header.
     size = int.from_bytes(content[:8], "little")
@@ -149,6 +156,7 @@ def _check_content(header: dict[str, Any], tensors: dict[str, Tensor]) -> None:
     """
     made = header["made"]
     numbers = [made["seconds"], made["misfit_m"], made["seed"], made["n_frames"], *made["origin"]]
+    # True and False are of the type bool, and are no numbers here.
     are_numbers = all(type(n) in (int, float) and math.isfinite(n) for n in numbers)
     if not (are_numbers and len(made["origin"]) == 3):
         raise ValueError("a number of its header is missing, not finite, or none")

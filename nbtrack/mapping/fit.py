@@ -22,7 +22,7 @@ from nbtrack.machinery.inputs import whole_number
 from nbtrack.machinery.launches import Recording, make_adam
 from nbtrack.machinery.settings import checked
 from nbtrack.mapping.files import Map
-from nbtrack.mapping.holdout import split_holdout, usual_depth_residual
+from nbtrack.mapping.holdout import split_holdout, usual_misfit
 
 _PENDING = 10  # iterations whose losses are read together, since each reading waits for a GPU
 _FINAL_RATE = 0.05  # learning rate at the end, relative to the start (NeuS)
@@ -53,9 +53,9 @@ def map_sequence(
 ) -> Map:
     """Fit a field to a sequence with known poses; a field that learns nothing is computed from it.
 
-    Settings are of the field's classes `Network`, or None if it has none, and `Settings`. A killed
-    run goes on from the file `checkpoint`, which the caller removes; it has the same batches as an
-    uninterrupted run. `code`, any text, tells versions of the program apart. Raises DataError for
+    `network` is of the field's class `Network` (None: it has none), `settings` of its `Settings`. A
+    killed run goes on from the file `checkpoint`, with the batches of an uninterrupted run; the
+    caller removes it. `code`, any text, tells versions of the program apart. Raises DataError for
     frames without depth or pose, or another map's checkpoint; ConfigError; NumericalError.
     """
     bounds = observed_bounds(sequence)
@@ -63,22 +63,22 @@ def map_sequence(
     settings = checked(settings, kind.Settings)
     network = checked(network, kind.Network) if issubclass(kind, LearnedField) else None
     recipe = recipe_of(field_name, sequence, network, settings, seed)
-    start = time.perf_counter()
-    mapped, _ = split_holdout(len(sequence), settings.holdout_every)
+    mapped, _ = split_holdout(len(sequence), settings.holdout_every)  # indices of frames
     if issubclass(kind, LearnedField):
         with advise_on_memory(f"mapping.{field_name}.n_rays={settings.n_rays}"):
-            with threads(1):  # the rounding of sums, and so the start, depends on their number
+            with threads(1):  # on more, sums are rounded otherwise, and so are initial weights
                 field = make_field(field_name, network, bounds, seed).to(device)
             with suited_to(field.width, settings.tf32):
                 fit = _Fit(recipe | {"code": code}, settings, field, sequence, mapped)
                 fit.run(checkpoint, on_iteration)
         history, seconds = fit.history, fit.seconds
     else:
+        start = time.perf_counter()
         field = kind.from_frames(sequence, mapped, bounds, settings).to(device)
         history, seconds = [field.diagnostics()], time.perf_counter() - start
         on_iteration(1.0, history[0])
     made = {"seconds": seconds, "mapped_frames": len(mapped), "device": device_name(field.device)}
-    record = recipe | made | {"misfit_m": usual_depth_residual(field, sequence, mapped)}
+    record = recipe | made | {"misfit_m": usual_misfit(field, sequence, mapped)}
     return Map(field, sequence.intrinsics, record, pd.DataFrame(history).rename_axis("iteration"))
 
 
@@ -106,7 +106,7 @@ class _Fit:
         self, recipe: dict, settings: Any, field: LearnedField, seen: RgbdSequence, mapped: Frames
     ) -> None:
         """Prepare to fit a field to the frames `mapped` of the sequence `seen`."""
-        # Another type of device draws other random numbers, and so is part of the recipe.
+        # The type of device is part of the recipe, since each type draws other random numbers.
         self.recipe = {**recipe, "device": field.device.type}
         self.settings = settings
         self.field = field
@@ -120,7 +120,7 @@ class _Fit:
         field.prepare(seen, mapped)
         self.seconds = 0.0
         self.history = []
-        self.terms: list[str] = []  # names of the loss terms, known from the first batch on
+        self.terms: list[str] = []  # names of the loss terms; empty until the first batch
 
     def run(self, checkpoint: Path | str | None, on_iteration: OnIteration) -> None:
         """Fit from the checkpoint, if any, to the last iteration; then make the field constant."""
@@ -140,7 +140,7 @@ class _Fit:
         for iteration in iterations:
             self.rate.fill_(learning_rate(self.settings, iteration))
             pending.append(self.recording.run(self._descend))
-        diagnostics = self.field.diagnostics()
+        diagnostics = self.field.diagnostics()  # after the last of the steps; recorded with each
         for iteration, row in zip(iterations, torch.stack(pending).tolist(), strict=True):
             values = dict(zip(self.terms, row, strict=True))
             if not all(map(math.isfinite, row)):

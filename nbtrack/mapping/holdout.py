@@ -11,8 +11,8 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import Field, LearnedField
 from nbtrack.machinery.inputs import checked_pose
 
-_MISFIT_PIXELS = 500  # random pixels of a frame that a residual is computed from
-_MISFIT_FRAMES = 10  # frames of a map that its usual residual is computed from
+_MISFIT_PIXELS = 500  # random pixels of a frame from which its misfit is computed
+_MISFIT_FRAMES = 10  # mapped frames from which a map's usual misfit is computed
 
 
 def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:
@@ -29,12 +29,12 @@ def split_holdout(n_frames: int, every: int) -> tuple[Frames, Frames]:
     return np.setdiff1d(indices, held_out), held_out
 
 
-def depth_residual_of(field: Field, frame: Frame) -> float:
-    """The median distance (m) between a map and what a frame measured, at the frame's true pose.
+def misfit_of(field: Field, frame: Frame) -> float:
+    """The misfit (m) of a map in a frame: how far the map is off what the frame measured.
 
-    For a field that can be rendered, this is the median over random pixels of
-    |rendered depth - measured depth|. For points and grids it is the median of the field's absolute
-    distance at measured points. It is NaN for a frame without measured depth.
+    It is a median over random measured pixels, at the frame's true pose: of |rendered depth -
+    measured depth| for a field that can be rendered; for points and grids, of the absolute distance
+    that the field has at the measured points. It is NaN for a frame without measured depth.
     """
     if not frame.has_depth:
         return float("nan")
@@ -54,12 +54,12 @@ def depth_residual_of(field: Field, frame: Frame) -> float:
     return float((rendered_depth - measured_depth).abs().median())
 
 
-def usual_depth_residual(field: Field, sequence: RgbdSequence, mapped: Frames) -> float:
-    """The median `depth_residual_of` (m) over ten mapped frames, evenly spread.
+def usual_misfit(field: Field, sequence: RgbdSequence, mapped: Frames) -> float:
+    """A map's usual misfit (m): the median misfit in ten mapped frames, evenly spread.
 
-    It is 0 if none of them has depth: then the least allowance of `check_belongs` applies.
+    It is 0 if none of them has depth. `check_belongs` then allows its minimum, 5 cm.
     """
     spread = np.linspace(0, len(mapped) - 1, min(_MISFIT_FRAMES, len(mapped))).round().astype(int)
     frames = [sequence[index] for index in mapped[spread].tolist()]
-    residuals = [depth_residual_of(field, frame) for frame in frames if frame.has_depth]
-    return float(np.median(residuals)) if residuals else 0.0
+    misfits = [misfit_of(field, frame) for frame in frames if frame.has_depth]
+    return float(np.median(misfits)) if misfits else 0.0

@@ -14,7 +14,7 @@ TRACKERS: Registry[type[Tracker]] = Registry({"vr": VrTracker, "sdf": SdfTracker
 
 
 def tracker_class(name: str) -> type[Tracker]:
-    """The tracker class of a name. ConfigError, with the most similar name, for an unknown one."""
+    """The tracker class of a name. Raises ConfigError, which names a similar one, if unknown."""
     return look_up_kind("tracker", name, TRACKERS, ["name"])
 
 
@@ -26,8 +26,9 @@ def make_tracker(
     settings: TrackerSettings | None = None,
     seed: int = 0,
 ) -> Tracker:
-    """A tracker by name, for one trajectory. Then `tracker.track(frame)` estimates each pose.
+    """A tracker of the class `name`, for one trajectory. `tracker.track(frame)` estimates a pose.
 
-    Takes the arguments of `Tracker` and raises its errors; ConfigError for an unknown name.
+    The other arguments are those of `Tracker`. Raises ConfigError for an unknown name, and the
+    errors of `Tracker`.
     """
     return tracker_class(name)(field, T_world_camera, budget, settings, seed)

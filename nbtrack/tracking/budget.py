@@ -51,6 +51,8 @@ class ClockBudget:
         `device` is that of the tracker. A caller that stops earlier must call `close`, so that its
         last step is counted.
         """
+        # The clock starts here. The body of a generator, as `_steps` is one, runs only when the
+        # first step is asked for.
         return self._steps(self._now(device), device)
 
     def _now(self, device: torch.device) -> float:
@@ -59,14 +61,14 @@ class ClockBudget:
         return self._clock()
 
     def _steps(self, start: float, device: torch.device) -> Generator[int, None, None]:
-        """The steps of a frame that began at `start` (s). Asking for the first ends preparation."""
-        prepared = now = self._now(device)
-        mean, step = self.memory, 0
+        """The steps of a frame that began at `start` (s)."""
+        prepared = now = self._now(device)  # the first step begins: the tracker has prepared it
+        mean, step = self.memory, 0  # mean seconds of a step, and the number of steps so far
         self.memory = None  # stays None if the frame takes no step
         while mean is None or start + 1 / self.rate_hz - now >= mean:
             try:
                 yield step
-            finally:  # also when the caller closes the frame, since its search has converged
+            finally:  # a caller whose search has converged closes the frame, and `yield` raises
                 step += 1
                 now = self._now(device)
                 self.memory = mean = (now - prepared) / step
@@ -76,8 +78,8 @@ class StepBudget:
     """A budget with a fixed number of steps per frame, which is the same on every machine.
 
     The number may be fractional: after k frames exactly floor(k * steps_per_frame) steps were
-    allowed. With 6.8 frames take 6, 7, 7, 7, 7, 6, ... steps. Our choice, to reproduce the paper's
-    tables at the speed of its hardware.
+    allowed. With 6.8 steps per frame the frames take 6, 7, 7, 7, 7, 6, ... steps. Our choice, to
+    reproduce the paper's tables at the speed of its hardware.
     """
 
     def __init__(self, steps_per_frame: Number) -> None:
@@ -122,11 +124,12 @@ _MEASURED_STEPS = {"vr": (6.8, 36.1), "sdf": (15.3, 79.3)}
 def paper_steps(tracker: str, rate_hz: Number) -> float:
     """Steps per frame that "vr" or "sdf" takes on the paper's hardware at a rate (Hz).
 
-    The steps are linear in the time per frame, through the paper's numbers at 100 and 500 ms: a
-    step and the rest of a frame then cost the same at every rate. Table I has 5 Hz, for which Table
-    II has no column (our choice).
+    The paper gives steps for 100 and 500 ms per frame (Table II), but not for 5 Hz of Table I. The
+    steps at other rates lie on the line through both, as if a step and the rest of a frame cost the
+    same at every rate (our choice).
 
-    Raises ConfigError for another tracker, a rate beyond 0.001 to 1e6, or one without any step.
+    Raises ConfigError for another tracker, a rate beyond 0.001 to 1e6, or a rate so high that no
+    step fits into a frame.
     """
     budget_ms = 1000 / number("rate_hz", rate_hz, _FEWEST, _MOST)
     at_100, at_500 = look_up("tracker of the paper", tracker, _MEASURED_STEPS)

@@ -12,7 +12,7 @@ from nbtrack.tracking import paper_steps, tracker_class
 @typed
 @dataclass(frozen=True)
 class Method:
-    """A field, a tracker and their settings: a row of Table I or III."""
+    """A field and a tracker, by their names, and settings of both: a row of Table I or III."""
 
     label: str
     field: str
@@ -28,8 +28,8 @@ class Method:
     def usual_steps(self) -> float:
         """The default number of steps per frame.
 
-        It is 30 for a tracker that ends a frame when it has converged. The paper's trackers do not;
-        they take the steps of the paper's slowest rate, 2 Hz.
+        It is 30 for trackers that end a frame when they have converged. All others, such as the
+        paper's, take the steps of the paper's slowest rate, 2 Hz.
         """
         return 30 if tracker_class(self.tracker).converges else self.paper_steps(rate_hz=2)
 
@@ -66,7 +66,8 @@ def find_methods(methods: Methods) -> list[Method]:
     or if a method's tracker does not work in its field.
     """
     found = [look_up("method", m, METHODS) if isinstance(m, str) else m for m in methods]
-    check_argument("methods", found, Sequence[Method])  # users register their own, unchecked
+    # Checked here, since what users register in METHODS is not checked when they register it.
+    check_argument("methods", found, Sequence[Method])
     for method in found:
         tracker_class(method.tracker).check_field(field_class(method.field))
     return [method for place, method in enumerate(found) if method not in found[:place]]

@@ -31,7 +31,7 @@ class AdamSettings(TrackerSettings):
     orientation_rate: float = 1e-3  # of the unit quaternion
 
     def position_rate_m(self, metres_per_unit: float) -> float:
-        """The learning rate of the position in metres, in a map with this unit."""
+        """The learning rate of the position in metres, if a unit of the map is so many metres."""
         return self.position_rate * (metres_per_unit if self.position_unit == "map" else 1.0)
 
     def reach(self, steps: float, metres_per_unit: float) -> Reach:
@@ -52,23 +52,24 @@ class AdamTracker(Tracker):
     """
 
     Settings = AdamSettings
-    frame: Frame | None = None  # a copy; its tensors are overwritten by the next frame
+    # A copy of the current frame. The next frame overwrites its tensors.
+    frame: Frame | None = None
 
     @abc.abstractmethod
     def loss(
         self, T_world_camera: Transform, directions_camera: Points, color: Colors, depth: Values
     ) -> Scalar:
-        """The loss at a pose of pixels with directions (z = 1), colours in [0, 1], z-depths (m).
+        """The loss of pixels at a pose. Pixels have directions (z = 1), colours and z-depths (m).
 
-        On CUDA the loss is recorded in the third step and then replayed. So what else it depends
-        on, and changes between steps, must be in tensors.
+        Colours are in [0, 1]. On CUDA the loss is recorded in the third step, and replayed from
+        then on. So whatever else it depends on, and changes between steps, must be in tensors.
         """
 
     def begin(self, frame: Frame, T_starts: Transforms) -> None:
         """Start a frame's search at the pose with the lowest loss, computed on the same pixels."""
         if self.frame is None or self.frame.camera != frame.camera:
             self._allocate(frame)
-        # All that steps read is written in place, since on CUDA recorded steps read these tensors.
+        # All that steps read is written in place: on CUDA the recorded step reads these tensors.
         self.frame.color.copy_(frame.color)
         self.frame.depth_mm.copy_(frame.depth_mm)
         self.measured_pixels = frame.measured_pixels()
@@ -113,9 +114,9 @@ class AdamTracker(Tracker):
         return loss.detach()
 
     def _choose_pixels(self) -> None:
-        """Choose random measured pixels.
+        """Choose `n_pixels` random pixels among the measured ones.
 
-        Their number differs from frame to frame, so this is no part of what is recorded.
+        The number of measured pixels differs from frame to frame, so the choice cannot be recorded.
         """
         n_measured, size = self.measured_pixels.shape[1], (self.settings.n_pixels,)
         chosen = torch.randint(n_measured, size, generator=self.generator, device=self.device)

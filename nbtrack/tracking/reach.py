@@ -22,10 +22,10 @@ Motions = Float[np.ndarray, "frames 3"]  # m, along the axes of the world; or ra
 
 @dataclass(frozen=True)
 class Reach:
-    """How far a frame's search can move the camera along, and turn it about, one axis."""
+    """How far a frame's search can move the camera along one axis, and turn it about one axis."""
 
     position: float  # m, along an axis of the world
-    orientation: float  # rad
+    orientation: float  # rad, about an axis of the camera
 
 
 def reach(steps: float, rate: float) -> float:
@@ -42,8 +42,8 @@ def motion_of(
 ) -> tuple[Motions, Motions]:
     """The motion from the start of each frame's search to its true pose, without the first frame.
 
-    Offsets are in m along the world's axes; turns are rotation vectors (rad) in the start's camera
-    frame. The motion model gives the start from the true poses of the frames before.
+    Returns offsets in m along the world's axes, and turns as rotation vectors (rad) in the start's
+    camera frame. The motion model gives the start from the true poses of the frames before.
     """
     offsets, turns = np.zeros((2, len(T_world_camera) - 1, 3))
     for k, T_true in enumerate(T_world_camera[1:], start=1):
@@ -56,11 +56,12 @@ def motion_of(
 def greedy_follower(
     T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose"
 ) -> Poses:
-    """The path of a search that knows the true poses, and only its reach (m) limits it.
+    """The path of a search that knows the true poses, and that only its reach (m) limits.
 
-    It begins at the first pose. In each frame it moves to the nearest position within the reach
-    along each axis, and takes the true orientation. Being greedy, it is no lower bound: a search
-    that ends one frame farther away may be nearer in later frames.
+    The path begins at the first true pose. In each frame the search moves to the position that is
+    nearest to the true one within the reach along each axis, and takes the true orientation. Being
+    greedy, its error is no lower bound: a search that ends one frame farther away may be nearer in
+    later frames.
     """
     followed = [T_world_camera[0]]
     for T_true in T_world_camera[1:]:
@@ -72,7 +73,7 @@ def greedy_follower(
 
 
 def greedy_ate(T_world_camera: Poses, reach_m: float, motion_model: str = "previous_pose") -> float:
-    """The ATE (m) of `greedy_follower` on a path of known poses, without the first."""
+    """The ATE (m) of `greedy_follower` on a path of known poses. The first pose does not count."""
     followed = greedy_follower(T_world_camera, reach_m, motion_model)
     return trajectory_metrics(followed[1:], T_world_camera[1:])["ate_rmse_m"]
 
@@ -82,9 +83,11 @@ def reach_metrics(
 ) -> dict[str, float]:
     """The reach of a run, the share of its frames that need a larger one, and the greedy ATE (m).
 
-    `T_world_camera` are the true poses of the path, of which the first is the given start. The
-    result is empty if the reach is None, for a search without bound, and has only the reach if a
-    pose is unknown or there are fewer than two.
+    They are called `reach_m` and `reach_deg`, `beyond_reach_share`, and `greedy_ate_m`.
+    `T_world_camera` are the true poses of the path, beginning with the given start.
+
+    The result is empty if the reach is None, since then no bound limits the search. It has only the
+    reach if a pose is unknown, or if there are fewer than two poses.
     """
     if reach is None:
         return {}
@@ -100,6 +103,9 @@ def reach_metrics(
 
 
 def _nearest_start(motion_model: str, found: list[np.ndarray], T_true: np.ndarray) -> np.ndarray:
-    """The start that is nearest to the true pose, given the last (up to two) poses found."""
+    """The start that is nearest to the true pose, of those that the motion model gives.
+
+    `found` are the last two poses before, or the only one.
+    """
     starts = expected_poses(motion_model, found)
     return min(starts, key=lambda T_start: np.linalg.norm(T_start[:3, 3] - T_true[:3, 3]))

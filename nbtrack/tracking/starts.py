@@ -16,15 +16,16 @@ def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
     since hands start and stop within a frame. Raises ConfigError, with the most similar name, for
     any other model.
     """
-    last, one_before = estimates[-1], estimates[-2:-1]  # without a pose before no velocity is known
-    moved_on = [last @ np.linalg.inv(T) @ last for T in one_before]
-    models = {"previous_pose": [last], "better_of_both": [*moved_on, last]}
-    models["constant_velocity"] = moved_on or [last]
+    last = estimates[-1]
+    models = {model: [last] for model in ("previous_pose", "better_of_both", "constant_velocity")}
+    if len(estimates) > 1:  # after a single pose no velocity is known
+        moved_on = last @ np.linalg.inv(estimates[-2]) @ last
+        models |= {"better_of_both": [moved_on, last], "constant_velocity": [moved_on]}
     return look_up("motion model", motion_model, models)
 
 
 def rigid(T: Pose | Poses) -> Pose | Poses:
-    """Transforms whose rotation matrices are made orthogonal again.
+    """Make the rotation matrices of transforms orthogonal again; returns new transforms.
 
     Over thousands of frames rounding errors accumulate in rotations. One Newton step towards the
     nearest orthogonal matrix removes them.

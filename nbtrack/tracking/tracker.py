@@ -86,10 +86,11 @@ class Tracker(abc.ABC):
     ) -> None:
         """Take a field, and the camera's pose (m) before the first frame that will be tracked.
 
-        Field and budget are copied, so that later changes of the originals have no effect. Raises
-        ConfigError for a field in which the tracker does not work, a setting that is not allowed or
-        an unknown motion model; MissingError for a package that is not installed; DataError for a
-        pose that is not rigid.
+        Field and budget are copied, so that later changes of the originals have no effect.
+
+        Raises ConfigError for a field in which the tracker does not work, a setting that is not
+        allowed, or an unknown motion model; MissingError for a package that is not installed;
+        DataError for a pose that is not rigid.
         """
         self.check_field(field)
         self.settings = checked(self.Settings() if settings is None else settings, self.Settings)
@@ -102,7 +103,10 @@ class Tracker(abc.ABC):
 
     @classmethod
     def works_in(cls, field: type) -> bool:
-        """Whether it works in fields of a class: learned ones if it renders, else distances."""
+        """Whether the tracker works in fields of a class.
+
+        A tracker that renders needs a learned field, and any other tracker a signed distance.
+        """
         return issubclass(field, LearnedField) if cls.renders else field.is_distance
 
     @classmethod
@@ -113,7 +117,7 @@ class Tracker(abc.ABC):
         """
         kind = field if isinstance(field, type) else type(field)
         fits = issubclass(kind, Field) and cls.works_in(kind)
-        # A grid that is made from a density has no distances, although its class has.
+        # A grid that was made from a density holds no distances, although its class says so.
         if not fits or (kind.is_distance and not field.is_distance):
             named = getattr(kind, "name", kind.__name__)
             known = ", ".join(name for name, other in FIELDS.items() if cls.works_in(other))
@@ -134,7 +138,10 @@ class Tracker(abc.ABC):
         """Take one optimisation step; returns the loss before it, which may stay on a GPU."""
 
     def report(self) -> dict[str, float | bool]:
-        """What to record about the estimate, by column name; `lost`, if given, is a judgement."""
+        """What to record about the estimate, by column name.
+
+        It holds `lost`, whether the camera is lost, if the tracker judges its estimates.
+        """
         return {}
 
     @typed
@@ -166,7 +173,8 @@ class Tracker(abc.ABC):
 
     def restart_anywhere(self) -> None:
         """Go on from an unknown pose. Raises ConfigError if this tracker cannot find the camera."""
-        self.check_finds(in_corrected=False)  # raises: classes that can find it override this
+        # This raises. A class that can find the camera overrides the method.
+        self.check_finds(in_corrected=False)
 
     @classmethod
     def check_finds(cls, in_corrected: bool) -> None:
@@ -195,14 +203,17 @@ class Tracker(abc.ABC):
             setattr(self, name, state[name])
 
     def __reduce__(self) -> tuple:
-        """Copies and pickles are constructed anew and then take the `state`, like a resumed run."""
+        """How `copy` and `pickle` copy a tracker: they construct another one and restore its state.
+
+        The state goes to `__setstate__`, which is `restore`.
+        """
         arguments = self.field, self.estimates[-1], self.budget, self.settings
         return type(self), arguments, self.state()
 
     __setstate__ = restore
 
     def _warm_up(self, frame: Frame, T_starts: Poses) -> None:
-        """Take some steps that do not count, since the first ones load, allocate and record.
+        """Take some steps before any is counted: the first ones load, allocate and record.
 
         Afterwards estimates, budget and random numbers are as before.
         """

@@ -42,7 +42,7 @@ def track_sequence(
 ) -> Trajectory:
     """Track all frames of a sequence, beginning with the first frame's true pose.
 
-    If the start is not known, the first frame is tracked, too, and every frame has `STEPS_TO_FIND`
+    If the start is not known, the first frame is tracked, too. Every frame then has `STEPS_TO_FIND`
     steps, whatever the budget, until the tracker has found the camera (our choice). The file
     `checkpoint` is written every few seconds; a killed run goes on from it. `on_frame` is told the
     index of each frame and its translation error (m; NaN if the true pose is unknown).
@@ -66,8 +66,8 @@ def track_sequence(
     with advise_on_memory(f"tracking.{tracker.name}.n_pixels={tracker.settings.n_pixels}"):
         file.resume(take_up)
         for index in range(first + len(rows), len(sequence)):
-            is_found = is_start_known or not all(row.get("lost", False) for row in rows)
-            budget = None if is_found else StepBudget(STEPS_TO_FIND)  # None: the tracker's own
+            is_lost = not is_start_known and all(row.get("lost", False) for row in rows)
+            budget = StepBudget(STEPS_TO_FIND) if is_lost else None  # None: the tracker's own
             rows.append(_row(sequence, index, tracker.track(sequence[index], budget)))
             on_frame(index, rows[-1]["translation_error_m"])
             file.save(lambda: {"rows": rows, "tracker": tracker.state()})
@@ -78,7 +78,7 @@ def track_sequence(
 def _table_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
     """The rows of frames as a table. If the tracker judges its estimates, `lost` is in all rows.
 
-    A frame that was not searched, since it has no depth, has no judgement and counts as lost.
+    A frame without depth counts as lost: the tracker may not have searched and judged it.
     """
     frames = pd.DataFrame(rows)
     if "lost" in frames:
@@ -87,7 +87,7 @@ def _table_of(rows: list[dict[str, Any]]) -> pd.DataFrame:
 
 
 def _recipe(tracker: Tracker, sequence: RgbdSequence, is_start_known: bool) -> dict[str, Any]:
-    """What a run depends on, by the names that are in the error for another run's checkpoint."""
+    """What a run depends on. The names are told to users whose checkpoint is of another run."""
     field, budget, seed = tracker.field, str(tracker.budget), tracker.generator.initial_seed()
     method = [tracker.name, as_dict(tracker.settings), budget, seed, is_start_known]
     weights = dict(chain(field.named_parameters(), field.named_buffers()))
