@@ -21,10 +21,14 @@ class SceneBounds:
     declared_unit: float | None = None  # m, if the authors of a recording give it
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for corners that are not finite or span no box, or a unit <= 0."""
-        low, high = (tuple(float(x) for x in corner) for corner in (self.minimum, self.maximum))
+        """Makes the corners tuples of Python's floats.
+
+        Raises ConfigError for corners that are not finite or span no box, or a unit <= 0.
+        """
+        low, high = tuple(map(float, self.minimum)), tuple(map(float, self.maximum))
         unit = 1.0 if self.declared_unit is None else float(self.declared_unit)
-        if not all(0 < x < np.inf for x in (*np.subtract(high, low), unit)):
+        # NaN fails, too: no comparison with it holds.
+        if not all(0 < length < np.inf for length in (*np.subtract(high, low), unit)):
             raise ConfigError(f"{self} are no bounds: give a minimum and a larger maximum, in m")
         object.__setattr__(self, "minimum", low)
         object.__setattr__(self, "maximum", high)

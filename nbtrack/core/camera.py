@@ -26,7 +26,7 @@ class Intrinsics:
     cy: float  # principal point, row; H/2 is the image's middle
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a number that no camera has. Those of numpy become Python's."""
+        """Makes numbers of numpy Python's. Raises ConfigError for a number that no camera has."""
         lowest = {"width": 1, "height": 1, "fx": 1e-3, "fy": 1e-3, "cx": -1e7, "cy": -1e7}
         for name, low in lowest.items():
             kind = numbers.Integral if name in ("width", "height") else numbers.Real

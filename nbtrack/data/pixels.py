@@ -38,7 +38,7 @@ class Rays:
 
 
 class PixelSampler:
-    """Draws random pixels of a sequence as rays on a device, measured or not.
+    """Draws random pixels of a sequence as rays on a device, also pixels without measurement.
 
     The images stay integers; only drawn pixels become floating point. Images are kept on the device
     if it has enough memory, else on the host. This does not change what is drawn.

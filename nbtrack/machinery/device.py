@@ -92,14 +92,6 @@ def usual_modes() -> Iterator[None]:
         yield
 
 
-def matrix_products(tf32: bool) -> contextlib.AbstractContextManager[None]:
-    """Run a block with matrix products in full single precision, or with `tf32` in TF32.
-
-    Only NVIDIA's GPUs have TF32. It keeps 10 of the mantissa's 23 bits and takes less time.
-    """
-    return _changed("float32_matmul_precision", "high" if tf32 else "highest")
-
-
 def threads(number: int) -> contextlib.AbstractContextManager[None]:
     """Run a block with this number of CPU threads."""
     return _changed("num_threads", number)
@@ -109,8 +101,8 @@ def threads(number: int) -> contextlib.AbstractContextManager[None]:
 def _changed(name: str, value: Any) -> Iterator[None]:
     """Run a block with the global setting `name` of PyTorch at `value`; restore it afterwards.
 
-    If the setting has this value already, the block neither sets nor restores it: the value may
-    come from a block that runs in another thread, and that block will restore the original.
+    If the setting has this value already, nothing is set or restored. The value may come from a
+    block that runs in another thread, and that block will restore the original.
     """
     getter, setter = getattr(torch, f"get_{name}"), getattr(torch, f"set_{name}")
     before = getter()
@@ -126,13 +118,16 @@ def _changed(name: str, value: Any) -> Iterator[None]:
 
 @contextlib.contextmanager
 def suited_to(width: int, tf32: bool) -> Iterator[None]:
-    """Run a block with the CPU threads that suit a network, and with `matrix_products(tf32)`.
+    """Run a block with the CPU threads and the precision of matrix products that suit a network.
 
     A network with layers of few units (`width`) gets one thread, since sharing its small matrix
-    products takes longer than it saves. A wide one gets as many as the process already has.
+    products takes longer than it saves. A wide one gets as many as the process already has. Matrix
+    products have full single precision or, with `tf32`, TF32. Only NVIDIA's GPUs have TF32, which
+    keeps 10 of the mantissa's 23 bits and takes less time.
     """
     number = 1 if width < _WIDTH_FOR_THREADS else torch.get_num_threads()
-    with threads(number), matrix_products(tf32):
+    precision = "high" if tf32 else "highest"  # PyTorch's names of TF32 and single precision
+    with threads(number), _changed("float32_matmul_precision", precision):
         yield
 
 

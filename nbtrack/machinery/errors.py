@@ -81,7 +81,7 @@ def check_argument(name: str, value: Any, kind: Any) -> None:
 
 
 def _is_of(value: Any, kind: Any) -> bool:
-    """Whether a value is of a kind, as far as `check_argument` checks it."""
+    """Whether a value is of an annotated kind; True for kinds that `check_argument` leaves out."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is UnionType:
         return any(_is_of(value, part) for part in parts)
@@ -91,8 +91,10 @@ def _is_of(value: Any, kind: Any) -> bool:
         entries = value.tolist() if hasattr(value, "tolist") else value
         if not isinstance(entries, Sequence) or isinstance(entries, str | bytes):
             return False
-        fits = origin is Sequence or ... in parts or len(entries) == len(parts)
-        return fits and all(_is_of(entry, parts[0]) for entry in entries)
+        # `tuple[int, int]` has two entries; `tuple[int, ...]` and `Sequence[int]` have any number.
+        has_length = origin is tuple and ... not in parts
+        fits = not has_length or len(entries) == len(parts)
+        return fits and all(_is_of(entry, parts[0]) for entry in entries)  # parts are of one kind
     is_checked = kind in _NUMBERS or kind in (str, dict, NoneType)
     is_checked |= kind.__module__.partition(".")[0] in ("nbtrack", "pandas")
     return not is_checked or isinstance(value, _NUMBERS.get(kind, kind))

@@ -80,10 +80,10 @@ def tables_folder() -> Path:
     return project_folder() / "paper_tables"
 
 
-def _number(digits: str) -> float | int:
+def _as_float(digits: str) -> float | int:
     """A whole number of a JSON text as a float, so that 30 and 30.0 get one fingerprint.
 
-    It stays an int where the float would be rounded: two numbers must not become the same one.
+    If a float would round the number, it stays an int: two numbers must not become the same one.
     """
     return float(digits) if float(digits) == int(digits) else int(digits)
 
@@ -94,7 +94,7 @@ def fingerprint(*parts: Any) -> str:
     Equal numbers of different types, as 30 and 30.0, give the same digits.
     """
     as_given = json.dumps([as_dict(p) if dataclasses.is_dataclass(p) else p for p in parts])
-    plain = json.dumps(json.loads(as_given, parse_int=_number), sort_keys=True)
+    plain = json.dumps(json.loads(as_given, parse_int=_as_float), sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:12]
 
 
@@ -135,9 +135,10 @@ class Checkpoint:
     """
 
     def __init__(self, path: Path | str | None, recipe: dict[str, Any]) -> None:
-        """`recipe` holds by name what the run depends on.
+        """Take the path of the file, and a `recipe`, which holds by name what the run depends on.
 
-        It is stored in the file. `resume` compares it, and names in its error what differs.
+        The recipe is stored in the file. `resume` compares the file's recipe with this one, and
+        names in its error what differs.
         """
         self.path = None if path is None else absolute(path)
         self.recipe = recipe
@@ -159,9 +160,10 @@ class Checkpoint:
             return
         with loaded_checkpoint(self.path) as state:
             written = state["recipe"]
-            if changed := [name for name in self.recipe if written.get(name) != self.recipe[name]]:
-                others = ", ".join(changed).replace("_", " ")
-                raise DataError(f"{self.path} was made with another {others}: remove it")
+            others = [name for name in self.recipe if written.get(name) != self.recipe[name]]
+            if others:
+                words = ", ".join(others).replace("_", " ")
+                raise DataError(f"{self.path} was made with another {words}: remove it")
             take_up(state)
 
 

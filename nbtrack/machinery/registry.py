@@ -35,11 +35,14 @@ class Registry(UserDict[str, Entry]):
     """
 
     def __init__(self, entries: dict[str, Entry | str]) -> None:
-        self._entries = entries
+        self.data = entries
 
     @property
     def data(self) -> dict[str, Entry | str]:
-        """The dictionary that all methods of `UserDict` use, after all plug-ins added to it."""
+        """The dictionary that all methods of `UserDict` use, after all plug-ins added to it.
+
+        It is kept under the same name in `__dict__`, where `UserDict` looks for it in a copy.
+        """
         while _waiting:
             # Taken from the list before it is loaded: it uses registries, which come here again.
             plugin = _waiting.pop(0)
@@ -48,15 +51,11 @@ class Registry(UserDict[str, Entry]):
             except Exception as error:  # a fault of another package must not stop the program
                 why = f"({type(error).__name__}: {error}): mend or remove it"
                 tell(f"nbtrack: warning: plug-in {plugin.value} is left out {why}")
-        return self._entries
+        return self.__dict__["data"]
 
     @data.setter
     def data(self, entries: dict[str, Entry | str]) -> None:
-        self._entries = entries
-
-    def __copy__(self) -> "Registry":
-        """A registry with the same entries: `mock.patch.dict` copies what it restores."""
-        return Registry({**self.data})
+        self.__dict__["data"] = entries
 
     def __getitem__(self, name: str) -> Entry:
         """The entry of a name.
