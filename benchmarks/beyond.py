@@ -18,6 +18,7 @@ import torch
 from motions import HAND_HELD
 
 from nbtrack import METHODS, Method, load_preset, make_tracker, open_scenes, track_scenes
+from nbtrack.experiments.bench import described
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
 from nbtrack.experiments.presets import Preset
@@ -59,7 +60,7 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     results = track_scenes(scenes, TABLE_3, preset, RATES_3_HZ, frames=":")
     write("table_3_cells", results[_COLUMNS])
     device = device_name(choose_device())
-    note = f"Preset: smoke; budget: {preset.step_counts}; whole path; {device}."
+    note = f"Preset: {described(preset)}; budget: {preset.step_counts}; whole path; {device}."
     write_table_3(tables_folder() / "beyond", results, note)
     # Times are measured: one run after the other. The slice is spelled otherwise, so that none of
     # the runs above is taken from the cache.

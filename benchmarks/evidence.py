@@ -25,7 +25,7 @@ from motions import HAND_HELD, SPEEDS
 from nine_rooms import SDF, VR, verdicts
 
 from nbtrack import METHODS, Method, load_preset, map_scene, open_scenes, track_scenes
-from nbtrack.experiments.bench import camera_motion
+from nbtrack.experiments.bench import camera_motion, described
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import TABLE_1
 from nbtrack.experiments.presets import Preset
@@ -210,16 +210,24 @@ def main(experiment: str, seeds: int) -> None:
     name = f"{experiment}/table_1_cells" if grid.has_table else f"{grid.folder}/{experiment}"
     path = tables_folder() / f"{name}.csv"
     add_rows(path, (chunk for seed in range(seeds) for chunk in chunks_of(grid, seed)))
-    rows = pd.read_csv(path)  # rounded, as every reader of the file has them
     if experiment == "nine_rooms":
-        write_csv(path.parent / "verdicts.csv", verdicts(rows), float_format="%.4g")
-        rows = rows.query("path == 'mapped'")
-    if "sensor" in rows:
-        rows = rows.query("sensor == 'dataset'")
+        write_csv(path.parent / "verdicts.csv", verdicts(pd.read_csv(path)), float_format="%.4g")
     if grid.has_table:
-        motion, machine = camera_motion(grid.preset, rows), ", ".join(rows["device"].unique())
-        note = f"{motion}; preset: {grid.preset.name}; budget: {grid.preset.step_counts}; {machine}"
-        write_table_1(path.parent, rows, f"{note}.")
+        table_of(grid, path)
+
+
+def table_of(grid: Grid, path: Path) -> None:
+    """Make Table I of the rows in a CSV; of several paths or sensors only of the first one."""
+    rows = pd.read_csv(path)  # rounded, as every reader of the file has them
+    note = []
+    for name in ("path", "sensor"):
+        if name in rows:
+            rows = rows[rows[name] == rows[name].iloc[0]]
+            note.append(f"{name}: {rows[name].iloc[0]}")
+    note = [camera_motion(grid.preset, rows), *note, f"preset: {described(grid.preset)}"]
+    note += [f"budget: {grid.preset.step_counts}", f"seeds: {rows['seed'].nunique()}"]
+    note += [", ".join(rows["device"].unique())]
+    write_table_1(path.parent, rows, f"{'; '.join(note)}.")
 
 
 Chunk = tuple[dict[str, str | float], Callable[[], pd.DataFrame]]

@@ -8,6 +8,7 @@ import doctest
 import pydoc
 import re
 import runpy
+import shutil
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,6 +19,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 import documents
+import evidence
 
 
 def test_tables_are_those_of_the_files() -> None:
@@ -26,6 +28,20 @@ def test_tables_are_those_of_the_files() -> None:
     for text in texts:
         assert documents.written(text) == text, "run python benchmarks/documents.py"
     assert all(f"<!-- table: {name} -->" in "".join(texts) for name in documents.TABLES)
+
+
+WITH_TABLE = [name for name, grid in evidence.GRIDS.items() if grid.has_table]
+
+
+@pytest.mark.parametrize("name", WITH_TABLE)
+def test_committed_tables_are_those_of_their_runs(name: str, tmp_path: Path) -> None:
+    """Catches a table of two sensors or paths, and a caption that the code no longer writes."""
+    committed, folder = documents.PROJECT / "paper_tables" / name, tmp_path / name
+    folder.mkdir()
+    runs = shutil.copy(committed / "table_1_cells.csv", folder)
+    evidence.table_of(evidence.GRIDS[name], Path(runs))
+    for file in ("table_1.csv", "table_1.tex", "table_1_vs_paper.csv"):
+        assert (folder / file).read_text() == (committed / file).read_text()
 
 
 def test_the_exercises_have_the_answers_of_the_code() -> None:

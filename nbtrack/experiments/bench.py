@@ -199,18 +199,23 @@ def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]
 def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
     """A text for captions: how the camera moves in some runs, and how far from frame to frame."""
     are_rooms = set(preset.scenes.names) <= set(ROOMS)
-    kind = f"Camera: {preset.scenes.motion if are_rooms else 'recorded'} motion"
+    kind = f"{preset.scenes.motion} motion" if are_rooms else "motion of the recordings"
     if "path_m" not in results:
-        return kind
+        return f"Camera: {kind}"
     motion_mm = 1e3 * (results["path_m"] / results["frames"]).mean()
-    return f"{kind}, {motion_mm:.1f} mm a frame"
+    return f"Camera: {kind}, {motion_mm:.1f} mm a frame on average"
 
 
 def _note(preset: Preset, clock: bool) -> str:
     """A sentence on how the numbers were measured: preset, changed settings, budget, device."""
-    changed = changed_settings(preset.settings, PRESETS[preset.name].settings)
-    # Settings of the scenes' names are left out, since the table's columns have the names.
-    changed = [text for text in changed if not text.startswith(("scenes.names", "scenes.labels"))]
-    label = f"{preset.name}, with {', '.join(changed)}" if changed else preset.name
     budget = "wall clock" if clock else preset.step_counts
-    return f"Preset: {label}; budget: {budget}; device: {device_name(choose_device())}."
+    return f"Preset: {described(preset)}; budget: {budget}; device: {device_name(choose_device())}."
+
+
+def described(preset: Preset) -> str:
+    """A text for captions: the preset's name, and the settings that differ from the preset's."""
+    changed = changed_settings(preset.settings, PRESETS[preset.name].settings)
+    # The table's columns have the names of scenes, and the rows of Table II the numbers of pixels.
+    shown = ("scenes.names", "scenes.labels", "tables.pixels")
+    changed = [text for text in changed if not text.startswith(shown)]
+    return f"{preset.name}, with {', '.join(changed)}" if changed else preset.name

@@ -135,7 +135,8 @@ class Preset:
         ours = " and ".join(f"{self.tracking_of(t.lower()).n_pixels} ({t})" for t in PAPER_PIXELS)
         width, our_width = NetworkSettings().width, self.network_of("neus").width
         in_paper = f"measured there with n = {paper} and {width} units a layer"
-        return f"the paper's step counts, {in_paper}; here n = {ours} and {our_width} units"
+        counts = "the paper's step counts at 10 and 2 Hz, linear in time at other rates"
+        return f"{counts}, {in_paper}; here n = {ours} and {our_width} units"
 
 
 _SMALL = flat(read_object(Path(__file__).with_name("smoke.toml")))
