@@ -58,7 +58,7 @@ def latex_file(styler: Any, path: Path, note: str, wording: Wording = OUR_WORDIN
         has_steps="n_pixels" in cells.index.names,
         has_std=any(cell.std for cell in cells.to_numpy().flat),
         has_converged=any("‡" in cell.value for cell in cells.to_numpy().flat),
-        columns=[wording.scenes.get(scene, scene) for scene in cells],
+        columns=list(cells),
         groups=groups.items(),
     )
 
