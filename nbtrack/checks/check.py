@@ -26,9 +26,10 @@ _FRAMES_AT_ONCE = 32  # frames that are read at once; 50 MB at 640x480
 _POINTS_PER_FRAME = 3000  # about, in the cloud
 _N_PAIRS = 32  # pairs of frames that are compared
 _QUICK_PAIRS = 16  # pairs of frames that are compared in a quick look
-_ROUNDING = 1e-4  # share of the depth: smaller gaps, as of equal frames, leave nothing to explain
+# Share of the depth. Smaller gaps are rounding errors, as between equal frames, and need no cause.
+_ROUNDING = 1e-4
 _MIN_FRAMES = 30  # with fewer, pairs share too many frames to tell a small misfit
-_STRIDES = (5, 10, 20, 40)  # frames from one to the other of a pair, which still see the same
+_STRIDES = (5, 10, 20, 40)  # frames from the first to the second of a pair: both see much the same
 _TURNED_DEG = 30  # a camera may turn so far within a pair: half of what most cameras see
 _PRINTED = ["measured", "brightness", "moved_mm", "turned_deg"]  # columns of `DataReport.frames`
 _XYZ = ["x", "y", "z"]
@@ -41,8 +42,9 @@ class DataReport:
 
     recording: Recording
     frames: pd.DataFrame  # a row for each frame that was read: see `_read`
-    T_world_camera: Poses  # poses of all frames that have one, read as declared
-    cloud: pd.DataFrame  # x y z (m, world), red green blue (0 to 255), depth (m); no outliers
+    T_world_camera: Poses  # of all frames that have a pose, read as declared
+    # Measured points without outliers: x y z (m, world), red green blue (0 to 255), depth (m).
+    cloud: pd.DataFrame
     conventions: list[Convention]  # all that were compared, the declared one first
     best: Convention  # the declared one unless another is clearly better
     misfits: list[Misfit]  # fits of all causes; empty if there are too few frames to tell
@@ -95,9 +97,9 @@ class DataReport:
 
 
 def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
-    """Check every frame of a recording, or unless `is_whole` some pairs of frames, within seconds.
+    """Check all frames of a recording, or without `is_whole` a few pairs of them, within seconds.
 
-    Raises what `read_frames` does, and DataError if `is_whole` and no pixel has a depth.
+    Raises the errors of `read_frames`, and DataError if `is_whole` and no pixel has a depth.
     """
     ids = select_frames(recording, slice(None))
     T_world_camera = shifted(recording.T_world_camera[ids], -recording.origin)
@@ -111,20 +113,20 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     sequence.depths_mm[np.isin(sequence.depths_mm, no_depth)] = 0
     frame_pairs = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(frame_pairs, as_declared)
+    declared = conventions[0]
     cloud = _cloud(as_declared, sequence)
     is_far = cloud.depth > far_limit(cloud.depth)
-    # Causes are fitted only if the declared convention is the best and leaves a gap to explain.
-    # With few frames the gap must be large.
-    is_best = best is conventions[0]  # the declared one
+    # Causes are fitted only to a gap that the best convention leaves, if this is the declared one.
     has_gap = best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
-    has_enough = len(ids) >= _MIN_FRAMES or conventions[0].is_far_apart
-    misfits = fit_causes(frame_pairs, as_declared) if is_best and has_gap and has_enough else []
+    has_enough = len(ids) >= _MIN_FRAMES or declared.is_far_apart  # few frames tell a large gap
+    can_fit = best is declared and has_gap and has_enough
+    misfits = fit_causes(frame_pairs, as_declared) if can_fit else []
     main = main_misfits(frame_pairs, as_declared, misfits)
     step_m = findings.steps_of(frames, cloud.depth, recording.declared.depth_scale)
-    misread = findings.misreading(conventions[0], best, main, step_m)  # a sentence by its kind
+    misread = findings.misreading(declared, best, main, step_m)  # a list of sentences by their kind
     faults = [*findings.of_images(frames, no_depth, counts[0]), *misread.get("fault", [])]
     doubts, remarks = misread.get("doubt", []), misread.get("note", [])
-    if is_best:  # otherwise the numbers of poses and depths mean nothing
+    if best is declared:  # otherwise the numbers of poses and depths mean nothing
         faults += findings.of_poses(frames, recording) if "fault" not in misread else []
         faults += findings.of_units(cloud.depth[~is_far])
         remarks += findings.of_depths(cloud.depth)
@@ -137,13 +139,17 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
 
 
 def quick_look(recording: Recording) -> str:
-    """The gravest finding in a few pairs of frames, as "warning: ..." or "note: ..."; or empty."""
+    """The gravest finding in a few pairs of frames, as "warning: ..." or "note: ...".
+
+    It is an empty text if there is nothing to say, or if fewer than two frames have a pose.
+    """
     if recording.has_pose.sum() < 2:
         return ""
     report = check_recording(recording, is_whole=False)
     kind = "warning" if report.faults or report.doubts else "note"
-    # What was assumed of its files is known only after images were read.
-    return next((f"{kind}: {text}" for text in (*report.warnings, *recording.notes)), "")
+    # The recording's notes come after the check: they are complete only after images were read.
+    texts = report.warnings + recording.notes
+    return f"{kind}: {texts[0]}" if texts else ""
 
 
 def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
@@ -156,17 +162,18 @@ def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
 def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
     """At most `maximum` pairs of frames that see much the same, as indices of their poses.
 
-    The pairs are spread over the sequence, and each of `_STRIDES` occurs about equally often, but
-    none in which the camera turns too far. The poses may be of any convention, since all have the
-    same angles between frames.
+    The pairs are spread over the sequence. Each of `_STRIDES` occurs about equally often, but is
+    shortened if the camera usually turns by more than `_TURNED_DEG` within it. The poses may be of
+    any convention, since the angles between frames are the same in all.
     """
     n_frames = len(T_world_camera)
     if n_frames < 2:
         return np.empty((2, 0), int)
-    # At least 1, so that nothing is divided by 0: then strides are limited to `_TURNED_DEG` frames.
+    # A camera that turns less than 1 degree a frame counts as if it turned 1 degree, so that
+    # nothing is divided by 0.
     step_deg = max(1.0, np.median(_turned_deg(T_world_camera)))
-    largest = max(1, min(n_frames - 1, int(_TURNED_DEG / step_deg)))
-    strides = np.minimum(np.resize(_STRIDES, maximum), largest)
+    longest = max(1, min(n_frames - 1, int(_TURNED_DEG / step_deg)))
+    strides = np.minimum(np.resize(_STRIDES, maximum), longest)  # `resize` repeats them in turn
     first = np.rint(np.linspace(0, 1, maximum) * (n_frames - 1 - strides)).astype(int)
     return np.unique([first, first + strides], axis=1)
 
@@ -174,10 +181,10 @@ def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:
 def _read(
     recording: Recording, ids: Frames, ids_kept: Frames
 ) -> tuple[RgbdSequence, pd.DataFrame, np.ndarray]:
-    """Read the frames `ids`. Returns those of `ids_kept` as a sequence, a table, and counts.
+    """Read the frames `ids`. Returns the frames `ids_kept` as a sequence, a table, and counts.
 
-    The sequence's `depths_mm` are the files' values, which any reading can take. The table has a
-    row for each of `ids`:
+    The sequence's `depths_mm` are the depth values as the files have them, in the files' unit. The
+    table has a row for each of `ids`:
 
     - `measured`: the share of pixels with depth; `brightness`: the mean colour, in [0, 1];
     - `depth_step`: the greatest common divisor of all depth values;
@@ -186,8 +193,9 @@ def _read(
       before, and `off_mm`, how far it is off the middle between the frames before and after; NaN if
       one of these has no pose.
 
-    Counts (2, 65536) are how often each depth value occurs, and in how many frames more than the
-    share `findings.SHARED` of the pixels have it. Images are read in parts, to bound the memory.
+    Of the counts (2, 65536) the first row tells how often each depth value occurs, and the second
+    in how many frames a share of the pixels above `findings.SHARED` has it. Images are read in
+    parts, which bounds the memory.
     """
     parts, rows = [], []
     counts = np.zeros((2, 65536), int)
@@ -201,7 +209,7 @@ def _read(
                 counts[1] += of_frame > findings.SHARED * values.size
                 rows.append(((values > 0).mean(), color.mean() / 255, step, zlib.crc32(values)))
             parts.append(part.select(np.isin(part_ids, ids_kept)))
-            if len(ids) > _FRAMES_AT_ONCE:  # a single part is left for whoever reads next
+            if len(ids) > _FRAMES_AT_ONCE:  # a single part is kept: mapping reads it again
                 images_of(recording).forget()
             bar.update(len(part))
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
@@ -225,9 +233,10 @@ def _add_motion(frames: pd.DataFrame, T_world_camera: Poses) -> None:
 
 
 def _cloud(as_declared: Reading, stored: RgbdSequence) -> pd.DataFrame:
-    """Coloured points (m, world) of a sequence that is read as declared: see `DataReport.cloud`.
+    """The table `DataReport.cloud` of a sequence, but with outliers.
 
-    `stored.depths_mm` are the files' own values. Points without depth are left out, outliers not.
+    `stored.depths_mm` are the depth values as the files have them. Points without depth are left
+    out.
     """
     stride = max(1, round((stored.depths_mm[0].size / _POINTS_PER_FRAME) ** 0.5))
     points_camera = as_declared.points(*on_grid(stored.depths_mm, stride)).numpy()

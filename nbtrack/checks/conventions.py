@@ -17,10 +17,10 @@ _CLEARLY_BETTER = 1.3  # ratio of two agreements (our choice)
 _NEARER = 3  # ratio of two mean gaps (our choice)
 _ALIKE = 0.95  # agreements above this share of the highest count as equal to it
 PLAUSIBLE_DEPTH = (0.2, 20.0)  # m; a median depth outside of this range has a wrong unit
-# The largest usual mean gap, as a share of the depth. Of the right recordings in
-# docs/tried.md a Kinect with poses of KinectFusion has the largest, 0.0048; a HoloLens has 0.0019,
-# rendered rooms at most 0.0019. The first 36 frames of that Kinect's alone have 0.0083, so that up
-# to twice this is no evidence of a mistake by itself.
+# The largest usual mean gap, as a share of the depth. Of the right recordings in docs/tried.md a
+# Kinect with poses of KinectFusion has the largest gap, 0.0048; a HoloLens has 0.0019, and rendered
+# rooms have at most 0.0019. The first 36 frames of the Kinect alone have 0.0083, so that a gap of
+# up to twice the usual one is no evidence of a mistake by itself.
 _USUAL_APART = 0.0055
 _USUAL_M = 0.025  # m; a larger gap is unusual at any depth
 MIN_OVERLAP = 0.15  # with a smaller share of points that overlap nothing is concluded (our choice)
@@ -29,14 +29,10 @@ _NAMES = {  # of axes, in sentences
     "left up forward": "PyTorch3D axes",
 }  # fmt: skip
 _OPPOSITES = [("left", "right"), ("up", "down"), ("forward", "backward")]
+_IN_WORDS = [" ".join(words) for three in permutations(_OPPOSITES) for words in product(*three)]
 # All 48 orders and directions of three axes. Those that have a name come first, since `_best_of`
 # takes the first of conventions that fit alike.
-AXES = list(_NAMES) + [
-    words
-    for three in permutations(_OPPOSITES)
-    for words in map(" ".join, product(*three))
-    if words not in (*_NAMES, *SPELLED_AXES.values())
-]
+AXES = [*_NAMES, *(w for w in _IN_WORDS if w not in (*_NAMES, *SPELLED_AXES.values()))]
 # Depth values a metre, common ones first: 1000 is millimetres, 5000 TUM, 6553.5 Replica, 4000
 # RealSense at 0.25 mm, 10,000 tenths of a millimetre, 8000 and 80,000 SUN3D (both times 8), 256
 # KITTI, 100 centimetres. Metres (1) and micrometres (1e6) come last, since 16 bits hold them badly.
@@ -58,8 +54,8 @@ _UNITS = {
 class Convention(Agreement):
     """The declared reading, or one with a mistake undone, and how well pairs of frames agree."""
 
-    subject: str  # what has the mistake: "poses", "positions", "depth" or "calibration"
-    name: str  # what the subject is instead; it completes "your SUBJECT look like NAME"
+    subject: str  # what is read wrongly: "poses", "positions", "depth" or "calibration"
+    name: str  # what the subject really is; it completes "your SUBJECT look like NAME"
 
     @property
     def usual_apart(self) -> float:
@@ -69,7 +65,7 @@ class Convention(Agreement):
     @property
     def is_far_apart(self) -> bool:
         """Whether the mean gap is larger than in any part of a right recording, or is unknown."""
-        # The negation is true for NaN, too.
+        # An unknown gap is NaN: every comparison is false, and its negation true.
         return not self.apart <= min(2 * _USUAL_APART, _USUAL_M / self.depth_m)
 
     def is_clearly_better(self, other: "Convention") -> bool:
@@ -79,7 +75,7 @@ class Convention(Agreement):
     def __str__(self) -> str:
         verb = "look" if self.subject.endswith("s") else "looks"
         text = f"your {self.subject} {verb} like {self.name}"
-        # Axes that nobody uses fit as well as images that are turned or mirrored.
+        # If axes fit that nobody uses, the poses may be right and the images turned or mirrored.
         if "axes" in self.name and not self.name.startswith(("OpenGL", "OpenCV", "robot")):
             text += ", or the images, or those of depth alone, are turned or mirrored against them"
         return text
@@ -90,8 +86,8 @@ def fit_all(pairs: FramePairs, as_declared: Reading) -> tuple[list[Convention], 
 
     The declared convention comes first. It is the best one unless another is clearly better.
     """
-    # Axes can be declared by name or by words. Here they have their name, as in the hypotheses, so
-    # that the declared reading is recognised among those and is not compared twice.
+    # Axes can be declared by a name or by three words. `_hypotheses` has names where there are any.
+    # Here, too, so that the declared reading is recognised there, and is not compared twice.
     names = {words: name for name, words in SPELLED_AXES.items()}
     axes = names.get(as_declared.declared.camera_axes, as_declared.declared.camera_axes)
     as_declared = replace(as_declared, declared=replace(as_declared.declared, camera_axes=axes))
@@ -113,7 +109,7 @@ def axes_name(camera_axes: str, poses: str) -> str:
     return f"{_NAMES.get(camera_axes, 'axes')} (x {x}, y {y}, z {z}), {poses}"
 
 
-# Mistakes that other entries of the `Declaration` undo: subject, name, and these entries.
+# Mistakes that are undone by other entries of the `Declaration`: subject, name, and the entries.
 _DECLARED = [
     *(("poses", axes_name(axes, poses), {"camera_axes": axes, "poses": poses})
       for poses, axes in product((CAMERA_TO_WORLD, WORLD_TO_CAMERA), AXES)),
@@ -153,14 +149,15 @@ def _hypotheses(as_declared: Reading) -> Iterator[tuple[str, str, Reading]]:
 def _best_of(conventions: list[Convention]) -> Convention:
     """The declared convention (the first), unless another one is clearly better.
 
-    Another one is better if its mean gap is three times smaller, or just smaller where clearly more
-    points agree under it. Points alone do not tell: with positions that are mirrored, along an axis
-    along which the camera hardly moved or that it looks along, most or more points agree, too.
+    A convention is a candidate if surfaces meet under it and if the median depth is plausible for a
+    depth camera. Surfaces alone are not enough: they meet as well if depths and positions are wrong
+    by the same factor. Of the candidates with about the highest agreement the first is taken, since
+    `conventions` have the common ones first.
 
-    Only conventions are candidates whose surfaces meet and whose median depth is plausible for a
-    depth camera. Depths and positions that are wrong by the same factor let surfaces meet as well,
-    so that only the depth shows which unit is right. Of the candidates with about the highest
-    agreement the first is taken, since `conventions` have the common ones first.
+    This candidate is clearly better if its mean gap is three times smaller than the declared one's,
+    or if its mean gap is smaller and clearly more points agree. The number of points alone is not
+    enough: as many agree if positions are mirrored along an axis along which the camera hardly
+    moved, or along which it looks.
     """
     declared = conventions[0]
     near, far = PLAUSIBLE_DEPTH
@@ -169,7 +166,7 @@ def _best_of(conventions: list[Convention]) -> Convention:
     highest = max((c.agreement for c in plausible), default=0.0)
     best = next((c for c in plausible if c.agreement >= _ALIKE * highest), declared)
     times = 1 if best.is_clearly_better(declared) else _NEARER
-    # The declared mean gap is NaN where no surfaces meet.
+    # If no surfaces meet as declared, its mean gap is NaN. The comparison is false, as it should.
     return declared if best.apart >= declared.apart / times else best
 
 

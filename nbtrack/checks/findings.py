@@ -18,28 +18,30 @@ from nbtrack.recordings.recording import Recording
 # recordings, and rooms thinned to every twentieth frame, have up to 1.1 median steps.
 _OFF = 0.05  # m
 _OFF_STEPS = 2.5  # medians of the distance between frames
-_MIN_REPEATED = 0.05  # a larger share of frames that repeat the depth of the one before is a fault
+# It is a fault if a larger share of the depth images repeats the one before.
+_MIN_REPEATED = 0.05
 _MAX_STEP = 0.01  # share of the depth: coarser steps of a camera's depth are remarked (our choice)
-# Surfaces of right recordings in coarse steps lie 0.13 to 0.19 of a step apart.
+# Coarse steps of depth explain a gap below this share of a step. In right recordings with such
+# steps surfaces lie 0.13 to 0.19 of a step apart.
 _OF_STEP = 0.2
-# A depth value is no measurement if it is a larger share of all depths than SHARED, if it is that
-# in a larger share of the frames than _SHARING, and if it is more than _SPIKE times as frequent as
-# any other value (our choice).
+# A depth value is no measurement if three shares are large: more than SHARED of all depths have the
+# value, more than _SHARING of the frames have it at more than SHARED of their pixels, and it is
+# more than _SPIKE times as frequent as any value that is a measurement (our choice).
 SHARED, _SHARING, _SPIKE = 0.01, 0.25, 10
-_VALUES = 3  # a camera has at most so many of them (our choice)
-_BLACK = 0.02  # the median brightness, in [0, 1], below which images are black
+_VALUES = 3  # a camera has at most so many values for no measurement (our choice)
+_BLACK = 0.02  # images are black if their median brightness, in [0, 1], is below this
 
 
 def misreading(
     declared: Convention, best: Convention, main: list[Misfit], step_m: float = 0.0
 ) -> dict[str, list[str]]:
-    """A sentence about how the numbers are misread, by its kind: "fault", "doubt" or "note".
+    """Say how the numbers are misread: one sentence under its kind, "fault", "doubt" or "note".
 
-    `best` is from `fit_all`, and `main` from `main_misfits`. It is empty if nothing is wrong.
-    - Another convention is the best, or a cause explains the gaps, which then are those of right
-      recordings: a "note" if usual sensors have such an error, else a "fault".
-    - Depths come in steps (m; 0: none), which explain the gaps: a "doubt", or a "note" if these are
-      those of right recordings.
+    `best` is from `fit_all`, `main` from `main_misfits`, and `step_m` from `steps_of`. The first of
+    these that holds is said, and the dictionary is empty if none holds:
+    - Coarse steps of depth explain the gaps: a "doubt", or a "note" if the gaps are usual.
+    - Another convention than the declared one is the best: a "fault".
+    - A cause explains the gaps: a "note" if usual sensors have such an error, else a "fault".
     - Surfaces lie apart without a known cause: a "doubt", or a "fault" if they lie far apart.
     """
     depth_mm = 1e3 * declared.depth_m
@@ -77,9 +79,9 @@ def doubts_of_poses(
 ) -> Iterator[str]:
     """A doubt if it cannot be told whether the poses are read rightly.
 
-    The reason is that two frames see too little of the same, or, if `needs_proof`, that the camera
-    moves too little to tell conventions apart. The declared one must come first in `conventions`.
-    `frames` is the table of `check`.
+    It cannot be told if two frames see too little of the same. With `needs_proof` it cannot be told
+    either if the camera moves too little to tell conventions apart. The declared convention must
+    come first in `conventions`. `frames` is the table of `check`.
     """
     declared, *others = conventions
     file, measured = recording.pose_file.name, frames.measured.mean()
@@ -95,20 +97,21 @@ def doubts_of_poses(
 
 
 def no_depth_values(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> list[int]:
-    """The depth values, at most `_VALUES`, that many pixels share although the camera moves.
+    """The depth values, at most `_VALUES`, that the camera gives for no measurement.
 
-    Such a value is no measurement, but what the camera gives for none. `counts` and `frames` are
-    those of `check`: `counts[0]` is how often each depth value occurs, and `counts[1]` in how many
-    frames it is more than the share `SHARED` of the pixels.
+    Many pixels share such a value, although the camera moves. `counts` and `frames` are those of
+    `check`: `counts[0]` tells how often each depth value occurs, and `counts[1]` in how many frames
+    a share of the pixels above `SHARED` has it.
     """
     n_pixels, n_frames = counts
     is_shared = (n_pixels > SHARED * n_pixels.sum()) & (n_frames > _SHARING * len(frames))
     is_shared &= (np.count_nonzero(n_pixels) > _SPIKE) & (frames.moved_mm.median() > 0)
-    first = np.argsort(-n_pixels)[: _VALUES + 1]  # the most frequent values
-    # A camera's rounding makes many values frequent, but none so much more than all others.
-    is_last_spike = n_pixels[first[:-1]] > _SPIKE * n_pixels[first[1:]]
-    n_spikes = 1 + max(np.flatnonzero(is_last_spike), default=-1)
-    return sorted(int(value) for value in first[:n_spikes] if is_shared[value])
+    most_frequent = np.argsort(-n_pixels)[: _VALUES + 1]
+    # Frequencies fall by a factor above _SPIKE after the last value that is no measurement. Among
+    # measurements a camera's rounding makes some frequent, but none by so much.
+    falls = n_pixels[most_frequent[:-1]] > _SPIKE * n_pixels[most_frequent[1:]]
+    n_spikes = 1 + max(np.flatnonzero(falls), default=-1)
+    return sorted(int(value) for value in most_frequent[:n_spikes] if is_shared[value])
 
 
 def of_images(
@@ -136,11 +139,15 @@ def of_images(
 
 
 def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
-    """A fault if poses are read rightly, but some lie beside the path of their neighbours."""
+    """A fault if some poses lie beside the path of their neighbours.
+
+    Call it only if the declared convention is the best one: others distort the path.
+    """
     off = frames.off_mm / 1e3  # m
     is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)
-    # An odd pose also moves the middles that its neighbours are compared with, by half as much. So
-    # of three frames in a row only the one that is farthest off counts.
+    # An odd pose also makes its two neighbours look odd by half as much, since they are compared
+    # with the middle of their own neighbours. So of three frames in a row only the one that is
+    # farthest off counts.
     largest_of_three = off.rolling(3, min_periods=1, center=True).max()
     odd = off[is_odd & (off == largest_of_three)]
     if len(odd):
@@ -151,7 +158,10 @@ def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
 
 
 def of_units(depth: pd.Series) -> Iterator[str]:
-    """A fault if no camera measures the median depth (m), though depths and poses agree."""
+    """A fault if the median depth (m) is too small or too large for a depth camera.
+
+    Depths and poses agree with each other even so, if both have the same wrong unit.
+    """
     near, far = PLAUSIBLE_DEPTH
     median = depth.median()
     if median < near or median > far:
@@ -160,7 +170,7 @@ def of_units(depth: pd.Series) -> Iterator[str]:
 
 
 def of_depths(depth: pd.Series) -> Iterator[str]:
-    """A remark about depths (m) that are read rightly, if some are outliers."""
+    """A remark if some depths (m) are outliers, as `far_limit` defines them."""
     is_far = depth > far_limit(depth)
     if is_far.any():
         low, high = depth[is_far].min(), depth[is_far].max()
@@ -171,11 +181,11 @@ def of_depths(depth: pd.Series) -> Iterator[str]:
 
 
 def steps_of(frames: pd.DataFrame, depth: pd.Series, depth_scale: float) -> float:
-    """The step (m) between two values of depth (m) if it is coarse, else 0.
+    """The step (m) between two values that depths (m) can have, if it is coarse, else 0.
 
-    If the declared unit is wrong, depths and steps are wrong by the same factor; the test compares
-    them only with each other.
+    The step is compared with the depths alone. So it does not matter if the declared unit is wrong,
+    and both are wrong by the same factor.
     """
     step_m = np.gcd.reduce(frames.depth_step) / depth_scale
-    # The steps may be chance if the farthest point is fewer than eight of them away.
+    # If the farthest point is fewer than eight steps away, the step may be chance.
     return step_m if _MAX_STEP * depth.median() < step_m < depth.max() / 8 else 0.0

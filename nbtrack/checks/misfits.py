@@ -17,19 +17,22 @@ from nbtrack.checks.readings import AREA_SCALE, FramePairs, Gaps, Reading, cost_
 from nbtrack.machinery.progress import ProgressBar
 
 _STEPS = 12  # of Gauss-Newton, at most
-_STARTS = np.linspace(-0.9, 0.9, 8)  # of a fit of one number, beside the declared one
-_MORE = 1.2  # ratio of two numbers of areas that agree (our choice)
-_NEAR = 0.02  # share of the depth: a gap at which an area agrees by half (our choice)
+# A fit of one number may begin at these shares of its limit, if more than _MORE times as many areas
+# agree there as at the declared number. An area agrees by half at the gap _NEAR, a share of the
+# depth (our choice).
+_STARTS = np.linspace(-0.9, 0.9, 8)
+_MORE = 1.2
+_NEAR = 0.02
 _FACTORS = (4.0, 2.0, 1.0, 0.5, 0.2)  # a step is tried at these lengths, and the best is taken
 _WIDE = 5.0  # in a step the weights' scale is so many medians of the absolute gaps
 _ENOUGH = 0.02  # a step ends the fit if it changes each number by less than this x negligible
-# A cause is significant if the cost that it leaves is below this share of the declared reading's.
+# A cause is significant if it leaves less than this share of the declared reading's cost.
 _MAX_COST_LEFT = 0.75  # our choice
 _MAX_COST_LEFT_USUAL = 0.9  # our choice, for errors that usual sensors have
 _ALIKE = 0.95  # two costs count as equal if their ratio is at least this
-# No single cause is the whole explanation if all numbers together leave clearly less cost than the
-# best cause does: less than this share of it, and less by so much. Of a cost near 0 a share says
-# nothing (our choice).
+# No single cause explains the recording if a fit of all numbers at once leaves clearly less cost
+# than the best cause: less than _WHOLE times as much, and less by more than _CLEARLY (our choice).
+# The second condition is for costs near 0, of which a share says nothing.
 _WHOLE, _CLEARLY = 0.8, 0.05
 _RESAMPLED = 200  # draws of the bootstrap
 Hessians = Float[np.ndarray, "... k k"]
@@ -42,9 +45,9 @@ class Number(NamedTuple):
     label: str
     form: str  # format specification
     unit: str
-    limit: float  # the fit clips it to -limit and limit; an estimate there says nothing
-    negligible: float  # more than right recordings show (our choice)
-    usual: float = 0.0  # usual sensors have errors up to this: they are a note, not a fault
+    limit: float  # the fit clips the number to -limit and limit; an estimate there says nothing
+    negligible: float  # right recordings show estimates below this (our choice)
+    usual: float = 0.0  # usual sensors have errors up to this size: they are a note, not a fault
 
 
 _LENGTH, _ANGLE = ("+.3f", " m", 1.0, 0.02), ("+.1f", " deg", 30.0, 1.0)
@@ -85,17 +88,19 @@ class Misfit:
     reading: Reading  # with the estimated numbers
     numbers: dict[str, tuple[float, float, float]]  # by key: estimate, low and high end of interval
     apart: float  # the mean absolute gap under `reading`, as a share of the depth
-    # The cost under `reading` as a share of the cost without the numbers, or of that with the
-    # opposite numbers, whichever share is larger. Smaller is better.
+    # Smaller is better: the cost under `reading`, divided by the smaller one of two other costs.
+    # These are the costs with the numbers at 0, and with the opposite numbers.
     cost_left: float
 
     @property
     def is_significant(self) -> bool:
-        """Whether the cause is off, and explains much of the cost, by numbers within their limits.
+        """Whether the cause is surely there, and explains much of the cost.
 
-        It is off if the interval of any number has only values beyond what is negligible.
+        It is surely there if the whole interval of any number is farther from 0 than what is
+        negligible. All estimates must be within their limits.
         """
         rows = [(_NUMBERS[key], *estimate) for key, estimate in self.numbers.items()]
+        # An interval above 0 begins at `low`; one below 0 begins at `high`, which is negative.
         is_off = any(max(low, -high) > number.negligible for number, _, low, high in rows)
         is_within = all(abs(value) < number.limit for number, value, _, _ in rows)
         max_cost_left = _MAX_COST_LEFT_USUAL if self.is_usual else _MAX_COST_LEFT
@@ -116,10 +121,10 @@ class Misfit:
 
 
 def main_misfits(pairs: FramePairs, as_declared: Reading, misfits: list[Misfit]) -> list[Misfit]:
-    """The significant misfits that leave about the least cost, in the order of `misfits`.
+    """The misfits that explain the recording about equally well: significant, with the least cost.
 
-    `misfits` must be in the order of `CAUSES`, so that the first one returned has the fewest
-    numbers. Others that only add numbers to those of the first are left out.
+    They are in the order of `misfits`, which must be that of `CAUSES`, so that the first one has
+    the fewest numbers. Misfits that only add numbers to those of the first are left out.
 
     The list is empty if no misfit is significant. It is also empty if all numbers, fitted at once,
     leave clearly less cost: then none of the causes explains the recording.
@@ -136,7 +141,7 @@ def main_misfits(pairs: FramePairs, as_declared: Reading, misfits: list[Misfit])
 
 
 def fit_causes(pairs: FramePairs, as_declared: Reading) -> list[Misfit]:
-    """Fit each of `CAUSES` alone, from the numbers as declared."""
+    """Fit each of `CAUSES` alone, beginning at the declared numbers."""
     causes = ProgressBar("fitting", CAUSES.items())
     return [fit(pairs, as_declared, name, keys, start=as_declared) for name, keys in causes]
 
@@ -146,8 +151,9 @@ def fit(
 ) -> Misfit:
     """Fit the numbers `keys` of the cause `name`, while all others stay as declared.
 
-    The fit begins at the numbers that the reading `start` has. Each Gauss-Newton step is tried at
-    several lengths, and the scale of its weights follows the gaps.
+    `keys` are names of attributes of a `Reading`. The fit begins at the numbers that the reading
+    `start` has. Each Gauss-Newton step is tried at several lengths, and the scale of its weights
+    follows the gaps.
     """
     # The unit of a step is what is negligible of each number, so that all are of similar size.
     limit, unit = np.array([(_NUMBERS[key].limit, _NUMBERS[key].negligible) for key in keys]).T
@@ -173,8 +179,8 @@ def fit(
         values, gaps = tried[best], tried_gaps[best]
     H, g = _normal_equations(gaps, [gaps_at(values + move) for move in np.diag(unit)], AREA_SCALE)
     low, high = values + unit * _interval(H, g)
-    # If the opposite numbers fit as well, the cause is another one. For example a `late` of either
-    # sign interpolates poses.
+    # If the opposite numbers fit as well, the cause is another one. For example `late` interpolates
+    # poses, which smooths them, whatever its sign is.
     without, opposite = gaps_at(0 * values), gaps_at(-values)
     cost_left = max(_cost_ratio(gaps, without), _cost_ratio(gaps, opposite))
     intervals = zip(values.tolist(), low.tolist(), high.tolist(), strict=True)
@@ -183,12 +189,13 @@ def fit(
 
 
 def _best_start(values: np.ndarray, limit: np.ndarray, gaps_at: Callable) -> np.ndarray:
-    """The numbers at which a fit begins: other ones than given only if clearly more areas agree.
+    """The numbers at which a fit begins: `values`, or the best of `_STARTS` if clearly better.
 
-    Gauss-Newton finds nothing if the start is far off. Others are tried of a single number. An
-    unknown gap agrees with nothing.
+    Gauss-Newton finds nothing if it begins far off. `_STARTS` are tried only if `values` is a
+    single number, and are clearly better if more than `_MORE` times as many areas agree.
     """
     starts = [values, *_STARTS[:, None] * limit] if len(values) == 1 else [values]
+    # Unknown gaps are NaN, and so `nansum` takes their areas for areas that do not agree.
     agreeing = [np.nansum(1 / (1 + (gaps_at(tried) / _NEAR) ** 2)) for tried in starts]
     most = int(np.argmax(agreeing))
     return starts[most] if agreeing[most] > _MORE * agreeing[0] else values
@@ -207,12 +214,12 @@ def _interval(H: Hessians, g: Gradients) -> Float[np.ndarray, "2 k"]:
 
 
 def _solution(H: Hessians, g: Gradients) -> Gradients:
-    """The step of k numbers that solves H step = -g, and is 0 along undetermined directions."""
+    """The steps (... x k) that solve H step = -g. They are 0 along undetermined directions."""
     return -(np.linalg.pinv(H, rcond=1e-6, hermitian=True) @ g[..., None])[..., 0]
 
 
 def _normal_equations(gaps: Gaps, moved: list[Gaps], scale: float) -> tuple[Hessians, Gradients]:
-    """J W J' and J W gaps of each pair of frames, with Geman-McClure weights W at `scale`.
+    """H = J W J' and g = J W gaps of each pair of frames, with Geman-McClure weights W at `scale`.
 
     The Jacobian J is by finite differences: `moved` holds the gaps after each of the k numbers, one
     at a time, has grown by its unit.

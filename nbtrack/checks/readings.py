@@ -48,7 +48,8 @@ class Reading:
     camera: Intrinsics
     # Metres of one unit of the poses' x, y and z; negative for a mirrored axis.
     metres: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    is_mixed: bool = False  # rotations, but not positions, have the direction that is not declared
+    # The rotations of the file's poses are the inverse ones, while positions are as declared.
+    is_mixed: bool = False
     focal_share: float = 0.0  # both focal lengths grow by this share
     aspect: float = 0.0  # the vertical focal length grows by this share besides
     right: float = 0.0  # the principal point moves right by this share of the width
@@ -84,25 +85,25 @@ class Reading:
         return directions * z[..., None]
 
     def T_world_camera(self, file_poses: Poses, order: str) -> Poses:
-        """Camera-to-world poses (m) of cameras with OpenCV's axes.
+        """Camera-to-world poses (m), of cameras with OpenCV's axes, from the poses of the file.
 
-        `file_poses` are the matrices of the pose file. If the file has quaternions, they were read
-        in the order `order`, "wxyz" or "xyzw".
+        `file_poses` are matrices in the file's own convention. If the file has quaternions, they
+        were read in the order `order`, "wxyz" or "xyzw".
         """
-        T_file = file_poses.copy()
+        T = file_poses.copy()
         if self.declared.quaternion != order:
             # Recover the file's four numbers, and read them in the other order.
             w_first = order == "wxyz"
-            numbers = Rotation.from_matrix(T_file[:, :3, :3]).as_quat(scalar_first=w_first)
-            T_file[:, :3, :3] = Rotation.from_quat(numbers, scalar_first=not w_first).as_matrix()
+            numbers = Rotation.from_matrix(T[:, :3, :3]).as_quat(scalar_first=w_first)
+            T[:, :3, :3] = Rotation.from_quat(numbers, scalar_first=not w_first).as_matrix()
         if self.is_mixed:
-            T_file[:, :3, :3] = T_file[:, :3, :3].mT
-        T_file[:, :3, 3] *= self.metres
+            T[:, :3, :3] = T[:, :3, :3].mT
+        T[:, :3, 3] *= self.metres
         T_body_camera = np.eye(4)
         turn_deg = [self.turn_x, self.turn_y, self.turn_z]
         T_body_camera[:3, :3] = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
         T_body_camera[:3, 3] = self.x, self.y, self.z
-        return self.declared.poses_to_opencv(T_file) @ T_body_camera
+        return self.declared.poses_to_opencv(T) @ T_body_camera
 
 
 def on_grid(values: UInt16[np.ndarray, "frames h w"], stride: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -123,8 +124,10 @@ class Agreement:
     area_gaps: Gaps  # the median gap between the two surfaces in each area; NaN where unknown
     apart: float  # mean absolute gap of areas, as a share of the depth; NaN if none is known
     depth_m: float  # the median depth of the overlapping points
-    overlap: float  # share of all points that fall onto a measured surface and are not hidden by it
-    agreement: float  # as `overlap`, but each point counts from 1 (no gap) down to 0 (far apart)
+    # The share of all points that fall onto a measured surface, and are not hidden by it.
+    overlap: float
+    # The same share if each of these points counts between 1 (no gap) and 0 (far apart).
+    agreement: float
 
 
 def cost_of(gaps: Gaps, scale: float = AREA_SCALE) -> float:
@@ -152,7 +155,7 @@ class FramePairs:
         """Take the depth maps of pairs from `rgbd`, whose depth values are as in the files.
 
         `ids` are the numbers of the recording's frames that have a pose, and `pairs` are indices in
-        `ids`. The points that are compared are pixels of the first frame of each pair.
+        `ids`. Pixels on a grid in the first frame of each pair are the points that are compared.
         """
         self.pairs = pairs
         self.file_poses = recording.file_poses[ids]
@@ -182,8 +185,8 @@ class FramePairs:
         points_b = points_a @ T_b_a[:, :3, :3].mT + T_b_a[:, None, :3, 3]
         columns, rows, depth = project(reading.calibration, points_b)
         height, width = self.inverse_values.shape[2:]
-        # Positions as `grid_sample` takes them, (pairs, 1, points, 2): -1 is the first pixel's
-        # centre, 1 the last one's.
+        # Positions as `grid_sample` takes them, (pairs, 1, points, 2): -1 is the centre of the
+        # first pixel, and 1 the centre of the last one.
         uv = 2 * torch.stack([columns / (width - 1), rows / (height - 1)], dim=-1)[:, None] - 1
         blended = 1 / grid_sample(self.inverse_values, uv, "bilinear", align_corners=True)[:, 0, 0]
         nearest = 1 / grid_sample(self.inverse_values, uv, "nearest", align_corners=True)[:, 0, 0]
