@@ -89,7 +89,7 @@ def table_2(steps: pd.DataFrame, value: str = "steps") -> pd.DataFrame:
     """Table II in wide form: mean steps, a row per tracker and n, a column per budget (ms).
 
     `steps` has a row for each cell, with columns tracker, n_pixels, budget_ms, steps. With the
-    value "steps_std" cells hold the std over frames. Raises DataError for two rows of a cell.
+    value "steps_std" cells hold the std over repetitions. Raises DataError for two rows of a cell.
     """
     _check_keys(steps, _CELL_2)
     return _wide(steps, _CELL_2, value).reindex(steps["tracker"].unique(), level="tracker")
@@ -198,7 +198,7 @@ def style_table_1(
 def style_table_2(
     steps: pd.DataFrame, caption: str | None = None, default_pixels: dict[str, int] = PAPER_PIXELS
 ) -> TableStyler:
-    """Table II, mean ± std over frames; rows of whole numbers without a std have no decimals.
+    """Table II, mean ± std over repetitions; rows of whole numbers without a std have no decimals.
 
     Cells whose `converged` is true in `steps` are marked with `CONVERGED`. Each tracker's default
     pixels, the n used for Table I, are printed in bold with an asterisk.
