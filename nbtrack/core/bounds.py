@@ -48,7 +48,7 @@ class SceneBounds:
         return self.declared_unit or float(np.subtract(self.maximum, self.minimum).max() / 2)
 
     def far_bound(self, origins_world: Points, directions_world: Points) -> Values:
-        """The t at which each ray origin + t * direction, which starts in the box, leaves it.
+        """For each ray origin + t * direction that starts in the box, the t at which it leaves it.
 
         If directions have z = 1 in the camera frame, t is a z-depth (m). For rays that start
         outside, as those of a lost camera do, t may be small or negative.

@@ -186,7 +186,7 @@ def plot_panels(
     same_x: bool = False,
     limits: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Tables as panels below their titles: each number is a point on x, in the row of its index.
+    """Tables side by side, by their titles: each number is a point on x, in the row of its index.
 
     Each column is a method with its own colour and mark. All panels have the same rows, from top to
     bottom: the texts in the tables' indices, each at most once in a table. A pale line connects the
@@ -196,9 +196,9 @@ def plot_panels(
     texts = pd.Index(np.concatenate([table.index for table in panels.values()])).unique()
     grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
     for axes, (name, values) in zip(grid, panels.items(), strict=True):
-        y = texts.get_indexer(values.index)
-        ends = values.min(axis=1), values.max(axis=1)
-        axes.hlines(y, *ends, color="0.85", linewidth=2, zorder=1)
+        y = texts.get_indexer(values.index)  # the rows of these values
+        left, right = values.min(axis=1), values.max(axis=1)
+        axes.hlines(y, left, right, color="0.85", linewidth=2, zorder=1)
         for (label, color), mark in zip(style.method_colors(values).items(), _MARKS, strict=False):
             axes.plot(values[label], y, mark, color=color, mfc="none", mew=1.6, label=label)
         looks = zip((limits or {}).items(), (style.DASHED, style.DOTTED), strict=False)

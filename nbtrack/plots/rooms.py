@@ -42,14 +42,15 @@ def plot_slice(
     if room is not None and drawn[0].is_distance:
         drawn.insert(0, ExactDistance(room, drawn[0]))
     panels = new_axes(title, 5.4 - 0.8 * (len(drawn) - 1), 1, len(drawn), sharey=True)[0]
-    norm, bar = None, {"ax": panels, "aspect": 25, "pad": 0.015}  # those of the first, for all
+    bar = {"ax": panels, "aspect": 25, "pad": 0.015}
+    norm = None  # the first slice makes the colour scale and its bar; the others take the scale
     mean_m = np.nanmean(sequence.T_world_camera[:, :3, 3] @ scene.up_of(sequence.T_world_camera))
     height = mean_m if height is None else height
     above = f", {mean_m - height:.1f} m higher up" if abs(mean_m - height) > 0.05 else ""
     for axes, field in zip(panels, drawn, strict=True):
         up, page = scene.draw_from_above(axes, {f"cameras{above}": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T
-        step = (high - low).max() / 240  # m
+        step = (high - low).max() / 240  # m: at most about 240 points along a side
         points, places = _level_grid(page, low, high + step, step, height * up)
         is_seen = binary_opening(seen_by(points, sequence), iterations=2)  # without small spots
         norm = scene.draw_slice(axes, field, points, places, is_seen, norm, **bar)

@@ -58,10 +58,10 @@ class NotebookFigure(Figure):
     """
 
     def _repr_mimebundle_(self, **chosen: object) -> tuple[dict, dict]:
-        """No picture, only the metadata of the one that `_repr_png_` draws.
+        """Returns no picture, but the metadata of the picture that `_repr_png_` draws.
 
-        These are the title as alternative text, and the size (pixels) at which the picture is
-        shown, which is half of its own.
+        These are the title as alternative text, and the width and height (pixels) at which the
+        picture is shown: half of those that it has.
         """
         from IPython import get_ipython  # only IPython calls this method; it may not be installed
 

@@ -138,19 +138,21 @@ def _from_json(path: Path) -> Calibration:
     with naming_damaged(path, "description of a camera", _ADVICE):
         for key in unused:
             _check_unused(key, entries[key])
-        used = {key: _numbers(key, entries[key]) for key in entries.keys() & _COUNTS.keys()}
-        single = {key: numbers[0] for key, numbers in used.items() if len(numbers) == 1}
-        lens = tuple(used.get("distortion", [single.get(key, 0.0) for key in _LENS]))
-        stored_scale = single.get("depth_scale")
+        numbers = {key: _numbers(key, entries[key]) for key in entries.keys() & _COUNTS.keys()}
+        # Entries that are one number: all but a matrix and a list of distortion.
+        single = {key: values[0] for key, values in numbers.items() if len(values) == 1}
+        lens = tuple(numbers.get("distortion", [single.get(key, 0.0) for key in _LENS]))
+        scale = single.get("depth_scale")  # None if the file does not say it
         # A scale below 1 gives metres a depth value instead of depth values a metre.
-        scale = 1 / stored_scale if stored_scale and stored_scale < 1 else stored_scale
+        scale = 1 / scale if scale and scale < 1 else scale
         has_size = "width" in single or "height" in single
-        # One without the other is a KeyError, which `naming_damaged` makes a DataError.
+        # A width without a height is a KeyError, which `naming_damaged` makes a DataError.
         size = (int(single["width"]), int(single["height"])) if has_size else None
         # A missing number is NaN, which `calibration` refuses.
         K = camera_matrix(*[single.get(key, np.nan) for key in ("fx", "fy", "cx", "cy")])
-        if "intrinsic_matrix" in used:
-            K = np.reshape(used["intrinsic_matrix"], (3, 3)).T  # the file has it column by column
+        if "intrinsic_matrix" in numbers:
+            # The file has the matrix column by column.
+            K = np.reshape(numbers["intrinsic_matrix"], (3, 3)).T
     return replace(calibration(path, K, size), distortion=lens, depth_scale=scale, unused=unused)
 
 
@@ -164,7 +166,8 @@ def _numbers(key: str, value: Any) -> list[float]:
     # NaN fails since it is not below anything, and True since its type is bool.
     is_valid = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
     is_valid = is_valid and len(values) in _COUNTS[key]
-    is_valid = is_valid and (key not in ("width", "height") or values[0] % 1 == 0)
+    if is_valid and key in ("width", "height"):
+        is_valid = values[0] % 1 == 0
     if not is_valid or (key == "depth_scale" and values[0] <= 0):
         raise ValueError(f"{key} is {str(value)[:40]!r}")
     return [float(v) for v in values]

@@ -227,17 +227,16 @@ def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.
     if not folder.is_dir():
         raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
     path = folder / DECLARATION_FILE
-    declared = read_object(path) if path.is_file() else {}
+    values = read_object(path) if path.is_file() else {}
     try:
-        own_format = with_values(Declaration(), declared).format  # raises for a wrong key or value
+        declared_format = with_values(Declaration(), values).format  # raises for a wrong value
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
-    format = format or own_format or _told_by_files(folder)
+    format = format or declared_format or _told_by_files(folder)
     usual = look_up("format", format, FORMATS).declared
     unit_m = DATASET_UNITS.get(absolute(folder).name, 0.0) if format == "neural_rgbd" else 0.0
-    depth_scale = depth_scale or usual.depth_scale
-    usual = replace(usual, depth_scale=depth_scale, metres_per_unit=unit_m)
-    return replace(with_values(usual, declared), format=format)
+    usual = replace(usual, depth_scale=depth_scale or usual.depth_scale, metres_per_unit=unit_m)
+    return replace(with_values(usual, values), format=format)
 
 
 def _told_by_files(folder: Path) -> str:
@@ -247,12 +246,14 @@ def _told_by_files(folder: Path) -> str:
     first of equals: reading will then say what is missing. Raises MissingError if no format has any
     of its files, and DataError if several formats have all.
     """
-    shares = {name: np.mean([_is_there(folder, p) for p in f.needs]) for name, f in FORMATS.items()}
+    shares = {}  # by format, the share of its groups of files that the folder has
+    for name, layout in FORMATS.items():
+        shares[name] = np.mean([_is_there(folder, patterns) for patterns in layout.needs])
     maximum = max(shares.values())
     best = [name for name, share in shares.items() if share == maximum]
     if maximum == 0:
-        # For each format the first pattern of each group.
-        files = (f"{name} ({', '.join(p[0] for p in FORMATS[name].needs)})" for name in best)
+        # Of each format the first pattern of each group of files.
+        files = [f"{name} ({', '.join(p[0] for p in FORMATS[name].needs)})" for name in FORMATS]
         raise MissingError(f"{folder} is no recording: it needs the files of {'; '.join(files)}")
     if len(best) > 1 and maximum == 1:
         advice = f'choose with --format, or by format = "{best[0]}" in {DECLARATION_FILE}'

@@ -51,11 +51,11 @@ class Images:
     def __init__(self, recording: Recording) -> None:
         """Begin with nothing read."""
         self.recording = recording
-        self._digests: dict[Path, str] = {}
+        self._digests: dict[Path, str] = {}  # SHA-256 of files that were read
         self._contents: dict[Path, bytes] = {}  # of files that were read and not yet decoded
-        self._bytes_left = _MAX_BYTES
+        self._bytes_left = _MAX_BYTES  # how many more bytes `_contents` may hold
         self._first: dict[int, tuple[Pixels, Pixels]] = {}  # decoded to know the size, not yet used
-        self._camera: Intrinsics | None = None
+        self._camera: Intrinsics | None = None  # known from the first image on, see `camera_of`
         self.forget()
 
     def forget(self) -> None:
@@ -90,14 +90,14 @@ class Images:
         DataError if a file is damaged, or is of another kind or size.
         """
         camera = self.camera_of(ids[0])
-        all_ids = np.union1d(self._ids, ids)
+        all_ids = np.union1d(self._ids, ids)  # frames that are held, and those asked for
         if len(all_ids) > len(self._ids):
             shape = len(all_ids), camera.height, camera.width
             colors, depths = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint16)
             is_held = np.isin(all_ids, self._ids)
             if self._arrays:
                 colors[is_held], depths[is_held] = self._arrays
-            missing = np.flatnonzero(~is_held)
+            missing = np.flatnonzero(~is_held)  # places in the new arrays
             with ThreadPoolExecutor(4) as pool:  # decoding frees the GIL: a few suffice
                 decoded = pool.map(self._decoded, all_ids[missing].tolist())
                 for place, frame in zip(missing, decoded, strict=True):
@@ -105,7 +105,7 @@ class Images:
             self._ids, self._arrays = all_ids, (colors, depths)
         places = np.searchsorted(self._ids, ids)
         steps = np.unique(np.diff(places)) if len(places) > 1 else [1]
-        if len(steps) == 1 and steps[0] > 0:
+        if len(steps) == 1 and steps[0] > 0:  # a slice gives a view, and an array of places a copy
             places = slice(places[0], places[-1] + 1, steps[0])
         colors, depths = self._arrays
         return colors[places], depths[places]
@@ -135,7 +135,8 @@ class Images:
     def _decoded(self, index: int) -> tuple[Pixels, Pixels]:
         """Colour and depth of a frame in the camera's size, without the lens's distortion.
 
-        Depth is in the unit of the files, and 0 where none is measured.
+        Depth is in the unit of the files, and 0 where none is measured. `camera_of` must have been
+        called: it sets what all images are made to fit.
         """
         recording, shape = self.recording, (self._camera.height, self._camera.width)
         color, depth = self._first.pop(index, None) or self._pixels(index)

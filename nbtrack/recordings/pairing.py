@@ -60,11 +60,13 @@ def nearest(times: Times, others: Times, tolerance: float) -> Frames:
 
 
 def _in_unit_of(times: Times, stamps: Times) -> Times:
-    """Stamps (s) of the same clock as some times (s), in whose unit `in_seconds` may have erred.
+    """Stamps (s) with the unit that brings most of them near some times (s) of the same clock.
 
-    It takes each list by itself, so that it reads a fast or sparse count as one of another unit.
+    `in_seconds` reads each list by itself, and so may take a fast or sparse count for one of
+    another unit. If no unit brings more than half of the shorter list, and more than one of it,
+    near the other list, the stamps are returned as they are.
     """
-    for scale in (1.0, 1e-3, 1e-6, 1e-9, 1e3, 1e6, 1e9):
+    for scale in (1.0, 1e-3, 1e-6, 1e-9, 1e3, 1e6, 1e9):  # 1 first: most units are right
         n_near = (nearest(times, scale * stamps, _TOLERANCE) >= 0).sum()
         if n_near > max(1, min(len(times), len(stamps)) / 2):
             return scale * stamps

@@ -31,6 +31,7 @@ from nbtrack.recordings.formats import Declaration, Format
 from nbtrack.recordings.pose_files import Times, from_quaternions
 
 _ADVICE_ON_DEPTH = "run `pip install pyliblzfse`, or put 16-bit PNG files (mm) into depth/ instead"
+_CAMERA_ENTRIES = ("fx", "fy", "cx", "cy", "width", "height")  # of Polycam's files
 
 
 def _camera(path: Path, numbers: Sequence[float]) -> Calibration:
@@ -111,8 +112,8 @@ def _polycam_camera(path: Path) -> Calibration:
     rows = []
     for file in map(_corrected, sorted(path.parent.glob("*.json"))):
         with naming_damaged(file, "camera of Polycam", "export the recording again"):
-            content, names = read_object(file, "JSON"), ("fx", "fy", "cx", "cy", "width", "height")
-            rows.append([float(content[name]) for name in names])
+            content = read_object(file, "JSON")
+            rows.append([float(content[name]) for name in _CAMERA_ENTRIES])
     return _camera(path, np.median(rows, axis=0).tolist())
 
 

@@ -42,13 +42,14 @@ def in_seconds(times: Times) -> Times:
     [0.0, 0.033, 0.067]
     """
     known = times[np.isfinite(times)]
-    usual = np.median(np.abs(known)) if len(known) else 0.0
-    step = np.quantile(np.abs(np.diff(known)), 0.5, method="lower") if len(known) > 1 else 0.0
-    if (known % 1 != 0).any() or np.abs(known[:1]).sum() > 100 * step:  # no count from the start
-        step = 0.0
+    median = np.median(np.abs(known)) if len(known) else 0.0
+    step = 0.0  # stays 0, which fits every unit, unless times are whole numbers from near 0 on
+    if len(known) > 1 and (known % 1 == 0).all():
+        median_step = np.quantile(np.abs(np.diff(known)), 0.5, method="lower")
+        step = median_step if np.abs(known[0]) <= 100 * median_step else 0.0
     units_s = np.array([1.0, 1e-3, 1e-6, 1e-9])
     # `argmax` finds the first unit that fits. If none fits, it is 0: the unit is a second.
-    unit_s = units_s[((usual * units_s < _LATEST) & (step * units_s < _SLOWEST)).argmax()]
+    unit_s = units_s[((median * units_s < _LATEST) & (step * units_s < _SLOWEST)).argmax()]
     return np.where(np.abs(times * unit_s) < _LATEST, times * unit_s, np.nan)
 
 
@@ -119,14 +120,16 @@ def check_rising(times: Times, source: Path) -> None:
 def check_order(files: list[Path]) -> None:
     """Raises DataError if the frames may have another order than the files, sorted by numbers."""
     names = f"{files[0].parent}/{files[0].name}, {files[-1].name} and the others"
-    # Words must be equal: sorted words, as Feb and Jan, need not be in the order of frames.
-    kinds = {re.sub("[0-9]+", "0", path.stem.lower()) for path in files}
+    # The names without their numbers must be equal: sorted words, as Feb and Jan, need not be in
+    # the order of frames.
+    words = {re.sub("[0-9]+", "0", path.stem.lower()) for path in files}
+    # Either all names or none must hold a time since 1970.
     stamps = [stamp_in(path) for path in files]
     # Decimals must be equally many, unless all names are times: 1.5 may be 1.50, which comes after
     # 1.25, or chapter 1.5, which comes before chapter 1.25.
     decimals = {tuple(map(len, re.findall(r"\d\.(\d+)", path.stem))) for path in files}
-    is_mixed = any(stamps) or len(decimals) > 1
-    if len(kinds) > 1 or (None in stamps and is_mixed):
+    numbers_differ = None in stamps and (any(stamps) or len(decimals) > 1)
+    if len(words) > 1 or numbers_differ:
         found = f"{names} differ in more than their numbers, or in how these are written"
         raise DataError(f"{found}, which tells no order: number the images as they were recorded")
     # All names have the same form here, so that there is a column for each number in a name.
@@ -135,10 +138,11 @@ def check_order(files: list[Path]) -> None:
         is_counter = len(set(numbers.tolist())) == len(files) and np.ptp(numbers) < 2 * len(files)
         if is_counter and (steps < 0).any():
             raise DataError(f"{names} have numbers that order them in two ways: keep one of both")
-        # Hours, minutes or days repeat, and rise by 1 at a time.
-        usual, last = max(1, np.median(steps)) if len(steps) else 0, numbers[-1]
+        # The usual step; at least 1, since hours, minutes or days repeat and rise by 1 at a time.
+        usual = max(1, np.median(steps)) if len(steps) else 0
+        last = numbers[-1]
         # If a counter went back to 0 at `end`, its sorted numbers have a wide gap, and from the
-        # last number it is a usual step over `end` to the first one.
+        # last number over `end` to the first one it is about a usual step.
         for end in (10 ** len(str(last)), 12, 24, 31, 60, 2**8, 2**16, 2**32):
             step_over_end = numbers[0] + end - last
             if 0 < step_over_end <= 2 * usual and steps.max() > 10 * usual:

@@ -176,18 +176,18 @@ def _poses_and_times(
         with naming_damaged(file, f"pose file of {layout.label}", _AGAIN):
             tables.append(layout.read_poses(file, declared.quaternion))
     listed = checked_poses(np.concatenate([poses for poses, _ in tables]), path)
-    stamps = np.concatenate([times for _, times in tables])
-    no_stamps = np.full(len(stamps), np.nan)
+    stamps = np.concatenate([times for _, times in tables])  # s; NaN for a pose without a time
     if len(stamps) > 1 and np.ptp(stamps) == 0:  # a tool that has no times wrote the same one
-        stamps = no_stamps
+        stamps = np.full(len(stamps), np.nan)
     check_rising(stamps, path)
-    # Frames without recorded times get those of the poses if these are equally many.
-    is_one_each = len(stamps) == len(moments.times) and (np.diff(stamps) > 0).all()
+    # Frames without recorded times get those of the poses if each pose has one and these are
+    # equally many.
+    is_one_each = len(stamps) == len(moments.times) and np.isfinite(stamps).all()
     times = stamps if moments.recorded_times is None and is_one_each else moments.times
-    if "*" in path.name:
+    if "*" in path.name:  # every frame has a file of its own
         check_paired(moments.images, files)
         return listed, times, ""
     # In formats without `stamps_tell` the stamps are times, but do not say whose a pose is.
-    stamps = stamps if layout.stamps_tell else no_stamps
-    poses, note = moments.poses_of(path, listed, stamps, declared.inverted_if_world_to_camera)
+    telling = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
+    poses, note = moments.poses_of(path, listed, telling, declared.inverted_if_world_to_camera)
     return poses, times, f"{path.name}: {note}" if note else ""

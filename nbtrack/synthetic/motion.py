@@ -204,7 +204,7 @@ def _wander(
 
 
 def _relative_speed(n_frames: int, rng: np.random.Generator) -> Values:
-    """A smooth random speed for each frame, with a mean of 1; fast is up to three times slow."""
+    """A smooth random speed for each frame, with a mean of 1; it varies up to about threefold."""
     speed = np.exp(_wander(n_frames, rng, 0.4, spacing=14, limit=1.6))
     return speed / speed.mean()
 

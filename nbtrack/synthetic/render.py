@@ -81,13 +81,13 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     per_pixel = 640.0 / depth.shape[1]
     scale = focal * per_pixel * BASELINE  # disparity (px at width 640) times depth (m)
     seen = np.isfinite(depth) & (depth > 0)
-    exact = np.where(seen, scale / np.where(seen, depth, 1.0), 0.0)
+    exact = np.where(seen, scale / np.where(seen, depth, 1.0), 0.0)  # disparity (px), 0 if unseen
     lost = ~seen | _is_grazing(exact, focal)
     # On a plane of any slant disparity is affine in pixel coordinates, and its second difference is
     # 0. So a large second difference is an edge.
     bends = [np.abs(np.diff(exact, 2, axis=axis)) > EDGE_JUMP for axis in (0, 1)]
     is_edge = np.pad(bends[0], ((1, 1), (0, 0))) | np.pad(bends[1], ((0, 0), (1, 1)))
-    lost |= is_edge & (rng.uniform(size=depth.shape) < 0.6)  # (our choice)
+    lost |= is_edge & (rng.uniform(size=depth.shape) < 0.6)  # 60 % of edge pixels (our choice)
     shift = rng.normal(scale=LATERAL_NOISE / per_pixel, size=(2, *depth.shape))
     places = np.indices(depth.shape) + shift
     # Lookups interpolate: at a width of 96 the shift is below a tenth of a pixel, and would hardly
@@ -97,7 +97,8 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     noisy_disparity = looked_up + rng.normal(scale=DISPARITY_NOISE, size=depth.shape)
     disparity = np.rint(noisy_disparity / DISPARITY_STEP) * DISPARITY_STEP
     noisy_depth = scale / np.maximum(disparity, DISPARITY_STEP)
-    lost |= (noisy_depth < RANGE[0]) | (noisy_depth > RANGE[1]) | (share_seen < 0.999)
+    is_mixed = share_seen < 0.999  # a lookup that interpolates with a pixel that sees nothing
+    lost |= (noisy_depth < RANGE[0]) | (noisy_depth > RANGE[1]) | is_mixed
     return np.where(lost, 0.0, noisy_depth)
 
 
