@@ -56,7 +56,7 @@ def check_array(
 
 @cache  # frames and queries are checked thousands of times, and a type takes 50 us to make
 def _type_of(kind: Any, of: type, shape: tuple) -> type:
-    """The type, for `isinstance`, of arrays of the class `of` with a kind of numbers and a shape."""
+    """The type, for `isinstance`, of arrays of this class, kind of numbers and shape."""
     return kind[of, " ".join(map(str, shape))]
 
 

@@ -166,8 +166,7 @@ def _numbers(key: str, value: Any) -> list[float]:
     # NaN fails since it is not below anything, and True since its type is bool.
     is_valid = all(type(v) in (int, float) and abs(v) < _LARGEST for v in values)
     is_valid = is_valid and len(values) in _COUNTS[key]
-    if is_valid and key in ("width", "height"):
-        is_valid = values[0] % 1 == 0
+    is_valid = is_valid and (key not in ("width", "height") or values[0] % 1 == 0)
     if not is_valid or (key == "depth_scale" and values[0] <= 0):
         raise ValueError(f"{key} is {str(value)[:40]!r}")
     return [float(v) for v in values]

@@ -97,8 +97,8 @@ def add_kinect_noise(depth: Depth, focal: float, rng: np.random.Generator) -> De
     noisy_disparity = looked_up + rng.normal(scale=DISPARITY_NOISE, size=depth.shape)
     disparity = np.rint(noisy_disparity / DISPARITY_STEP) * DISPARITY_STEP
     noisy_depth = scale / np.maximum(disparity, DISPARITY_STEP)
-    is_mixed = share_seen < 0.999  # a lookup that interpolates with a pixel that sees nothing
-    lost |= (noisy_depth < RANGE[0]) | (noisy_depth > RANGE[1]) | is_mixed
+    # The last condition is a lookup that interpolates with a pixel that sees nothing.
+    lost |= (noisy_depth < RANGE[0]) | (noisy_depth > RANGE[1]) | (share_seen < 0.999)
     return np.where(lost, 0.0, noisy_depth)
 
 
