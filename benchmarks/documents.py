@@ -1,4 +1,4 @@
-"""The tables of README.md, benchmarks/README.md and docs/choices.md, from committed CSV files.
+"""The tables of README.md, benchmarks/README.md and of two pages in docs, from committed CSV files.
 
     python benchmarks/documents.py
 
@@ -18,7 +18,8 @@ from nbtrack.experiments.runs import over_rooms
 from nbtrack.tables import published_table_1, table_1
 
 PROJECT = Path(__file__).parents[1]
-DOCUMENTS = [PROJECT / name for name in ("README.md", "benchmarks/README.md", "docs/choices.md")]
+_NAMES = "README.md", "benchmarks/README.md", "docs/choices.md", "docs/tried.md"
+DOCUMENTS = [PROJECT / name for name in _NAMES]
 _RIGHT_TO = 0.02  # m; a map is right if its distance near surfaces has a smaller mean error
 # Short heads of the methods' columns. "LM" alone is LM in the corrected NeuS+ map.
 _HEADS = {
@@ -174,6 +175,14 @@ def memory(peaks: pd.DataFrame) -> pd.DataFrame:
     return shown(peaks, {name: (head, "{:.2f}") for name, head in columns.items()})
 
 
+def ablation(runs: pd.DataFrame) -> pd.DataFrame:
+    """ATE (cm), every frame tracked, by what was changed of a correction."""
+    runs = runs[runs["frames"] == ":"]
+    place = runs["scene"] + runs["path"].replace({"mapped": "", "second": ", 2nd"})
+    cm = 100 * runs.pivot_table("ate_m", "changed", place, sort=False)
+    return cm.map("{:.2f}".format)
+
+
 def choices(runs: pd.DataFrame) -> pd.DataFrame:
     """Ratios of errors at 2 Hz: of each other choice to ours, and of VR to SDF.
 
@@ -232,6 +241,7 @@ TABLES = {
     "image_size": (image_size, "paper_tables/corrected/image_size.csv"),
     "ten_seconds": (ten_seconds, "paper_tables/corrected/mapping.csv"),
     "memory": (memory, "benchmarks/cpu/memory.csv"),
+    "ablation": (ablation, "paper_tables/corrected/ablation.csv"),
     "choices": (choices, "paper_tables/evidence/choices.csv"),
 }
 """The function that makes each table, and the file that it takes."""

@@ -35,7 +35,7 @@ _N_POINTS = 300_000  # random pixels are drawn; those that show a plane are used
 # since surfaces are flat only nearby.
 _OFFSETS = (0.0, -0.03, -0.015, 0.015, 0.03)
 # Large scenes get more points, until cells with points have so many on average, or `_MAX_TIMES` as
-# many are drawn. Three rooms have 11 to 14; an office of 10 by 11 m has 1.3 (docs/tried.md).
+# many are drawn. Three rooms have 11 to 14; an office of 10 by 11 m has 2.8 (docs/tried.md).
 _POINTS_A_CELL = 10
 _MAX_TIMES = 4  # at most so many times `_N_POINTS` pixels are drawn
 # The smallest robust scales of a tracker's residuals (distance in m, luma) are so many times the

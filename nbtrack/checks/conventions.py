@@ -19,7 +19,7 @@ _ALIKE = 0.95  # agreements above this share of the highest count as equal to it
 PLAUSIBLE_DEPTH = (0.2, 20.0)  # m; a median depth outside of this range has a wrong unit
 # The largest usual mean gap, as a share of the depth. Of the right recordings in docs/tried.md a
 # Kinect with poses of KinectFusion has the largest gap, 0.0048; a HoloLens has 0.0019, and rendered
-# rooms have at most 0.0019. The first 36 frames of the Kinect alone have 0.0083, so that a gap of
+# rooms have at most 0.0018. The first 36 frames of the Kinect alone have 0.0083, so that a gap of
 # up to twice the usual one is no evidence of a mistake by itself.
 _USUAL_APART = 0.0055
 _USUAL_M = 0.025  # m; a larger gap is unusual at any depth
