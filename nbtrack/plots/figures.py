@@ -256,5 +256,5 @@ def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray
     tick_of_point, ticks = pd.factorize(texts)
     axes.set_xticks(range(len(ticks)), ticks)
     label_of_point, names = pd.factorize(labels)
-    from_middle = label_of_point - (len(names) - 1) / 2  # in places beside each other
-    return tick_of_point + from_middle * 0.5 / max(len(names), 4)
+    shift = label_of_point - (len(names) - 1) / 2  # 1 from label to label, about 0
+    return tick_of_point + shift * 0.5 / max(len(names), 4)

@@ -8,7 +8,6 @@ mean has a file `sequence.toml`, which may set any field of `Declaration`.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from zipfile import is_zipfile
 
 import numpy as np
 
@@ -221,9 +220,8 @@ def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.
     several formats.
     """
     if folder.is_file():
-        unzip = f"unpack it by `unzip {folder.name} -d {folder.stem}`, and "
-        advice = f"{unzip if is_zipfile(folder) else ''}give the recording's folder"
-        raise DataError(f"{folder} is a file: {advice}")
+        advice = f"or, if it is a ZIP file, unpack it by `unzip {folder.name} -d {folder.stem}`"
+        raise DataError(f"{folder} is a file: give the recording's folder, {advice}")
     if not folder.is_dir():
         raise MissingError(f"no folder {folder}: give a recording's, or a synthetic room's name")
     path = folder / DECLARATION_FILE

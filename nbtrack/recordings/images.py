@@ -124,10 +124,9 @@ class Images:
         self._resize, note = _resizing(color, depth, recording)
         if note and note not in recording.notes:
             recording.notes.append(note)  # reports on the recording print its notes
-        # The file whose image has the size that all must have; messages name it.
-        self._sized = (recording.depth_files if self._resize else recording.color_files)[first]
+        file = (recording.depth_files if self._resize else recording.color_files)[first]
         height, width = (depth if self._resize else color).shape[:2]
-        self._camera = recording.calibration.for_size(width, height, self._sized)
+        self._camera = recording.calibration.for_size(width, height, file)
         # The place of each pixel in the distorted image; empty without distortion.
         self._maps = _undistortion(self._camera, recording.calibration.distortion)
         return self._camera
@@ -142,8 +141,8 @@ class Images:
         color, depth = self._first.pop(index, None) or self._pixels(index)
         if self._resize:  # OpenCV takes the width first
             color = cv2.resize(color, shape[::-1], interpolation=cv2.INTER_AREA)
-        _check(recording.color_files[index], color, np.uint8, (*shape, 3), self._sized)
-        _check(recording.depth_files[index], depth, np.uint16, shape, self._sized)
+        _check(recording.color_files[index], color, np.uint8, (*shape, 3))
+        _check(recording.depth_files[index], depth, np.uint16, shape)
         if self._maps:
             color = cv2.remap(color, *self._maps, cv2.INTER_LINEAR)
             # An interpolated depth would be a point between two surfaces.
@@ -237,13 +236,10 @@ def _resizing(color: np.ndarray, depth: np.ndarray, recording: Recording) -> tup
     return True, f"colour is made as small as depth: {sizes}"
 
 
-def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...], sized: Path) -> None:
-    """Raises DataError unless the image of the file `path` has this type and shape.
-
-    The message also names the file `sized`, whose image has the size that is wanted.
-    """
+def _check(path: Path, image: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
+    """Raises DataError unless the image of the file `path` has this type and shape."""
     if image.dtype != dtype or image.shape != shape:
-        wanted = f"{dtype.__name__} of shape {shape}, for the size of {sized}"
+        wanted = f"{dtype.__name__} of shape {shape}, the size of the frame that was read first"
         found = f"{path} is {image.dtype} of shape {image.shape}"
         raise DataError(f"{found}: it must be {wanted} (depth has 16 bits and one channel)")
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from nbtrack.core.arrays import Poses, Position
+from nbtrack.core.arrays import Frames, Poses, Position
 from nbtrack.machinery.errors import DataError, MissingError
 from nbtrack.machinery.files import absolute
 from nbtrack.machinery.inputs import RIGID, checked_poses, read_numbers
@@ -132,24 +132,32 @@ def check_order(files: list[Path]) -> None:
     if len(words) > 1 or numbers_differ:
         found = f"{names} differ in more than their numbers, or in how these are written"
         raise DataError(f"{found}, which tells no order: number the images as they were recorded")
-    # All names have the same form here, so that there is a column for each number in a name.
-    for numbers in np.array([_numbers_in(path) for path in files]).T:
-        steps = np.diff(numbers)
-        is_counter = len(set(numbers.tolist())) == len(files) and np.ptp(numbers) < 2 * len(files)
-        if is_counter and (steps < 0).any():
-            raise DataError(f"{names} have numbers that order them in two ways: keep one of both")
-        # The usual step; at least 1, since hours, minutes or days repeat and rise by 1 at a time.
-        usual = max(1, np.median(steps)) if len(steps) else 0
-        last = numbers[-1]
-        # If a counter went back to 0 at `end`, its sorted numbers have a wide gap, and from the
-        # last number over `end` to the first one it is about a usual step.
-        for end in (10 ** len(str(last)), 12, 24, 31, 60, 2**8, 2**16, 2**32):
-            step_over_end = numbers[0] + end - last
-            if 0 < step_over_end <= 2 * usual and steps.max() > 10 * usual:
-                i = steps.argmax()
-                found = f"{names} have the numbers {numbers[0]} to {numbers[i]} and "
-                found += f"{numbers[i + 1]} to {last}: a counter that went back to 0 at {end}?"
-                raise DataError(f"{found} Then add {end} to the first; else leave {last} out")
+    if len(files) > 1:
+        # All names have the same form here, so that there is a column for each number in a name.
+        for numbers in np.array([_numbers_in(path) for path in files]).T:
+            _check_counter(numbers, names)
+
+
+def _check_counter(numbers: Frames, names: str) -> None:
+    """Raises DataError if one of the numbers in the names may have counted in another order.
+
+    `numbers` has an entry for each of several files, in their order; `names` describes the files.
+    """
+    steps, last = np.diff(numbers), numbers[-1]
+    is_counter = len(set(numbers.tolist())) == len(numbers) and np.ptp(numbers) < 2 * len(numbers)
+    if is_counter and (steps < 0).any():
+        raise DataError(f"{names} have numbers that order them in two ways: keep one of both")
+    # Hours, minutes or days repeat, and rise by 1 at a time.
+    usual = max(1, np.median(steps))
+    # If a counter went back to 0 at `end`, its sorted numbers have a wide gap, and from the last
+    # number over `end` to the first one it is about a usual step.
+    for end in (10 ** len(str(last)), 12, 24, 31, 60, 2**8, 2**16, 2**32):
+        step_over_end = numbers[0] + end - last
+        if 0 < step_over_end <= 2 * usual and steps.max() > 10 * usual:
+            i = steps.argmax()
+            found = f"{names} have the numbers {numbers[0]} to {numbers[i]} and "
+            found += f"{numbers[i + 1]} to {last}: a counter that went back to 0 at {end}?"
+            raise DataError(f"{found} Then add {end} to the first; else leave {last} out")
 
 
 def read_poses(path: Path, quaternion: str = "xyzw") -> tuple[Poses, Times]:

@@ -15,6 +15,7 @@ from nbtrack.core.arrays import Frames, Position
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery.errors import DataError
 from nbtrack.recordings.images import images_of
+from nbtrack.recordings.pose_files import shifted
 from nbtrack.recordings.recording import Recording, open_recording
 
 # A depth is an outlier if it is more than so many times the distance within which nine in ten
@@ -74,8 +75,7 @@ def read_frames(
     colors, depths = images.arrays_of(ids)
     depths_mm = depths if as_stored else images.in_millimetres(depths, ids)
     origin = recording.origin if origin is None else origin
-    T_world_camera = recording.T_world_camera[ids]
-    T_world_camera[:, :3, 3] -= origin
+    T_world_camera = shifted(recording.T_world_camera[ids], -origin)
     return RgbdSequence(
         recording.name, images.camera_of(ids[0]), colors, depths_mm, T_world_camera=T_world_camera,
         frame_ids=ids, times=recording.times[ids], origin=origin,

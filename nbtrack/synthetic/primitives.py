@@ -188,6 +188,7 @@ class Cylinder(Solid):
         """Unit normals of the side or of a cap, whichever is nearer to each point."""
         along, across = self._split(points - self.center)
         beyond_side, beyond_cap = (self._coordinates(points) - self.half).T
+        # On the axis the length is 0, which would give 0/0.
         lengths = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-12)
         of_cap = np.where(along < 0, -1.0, 1.0)[:, None] * self._axis
         return np.where((beyond_cap > beyond_side)[:, None], of_cap, across / lengths)
