@@ -29,15 +29,16 @@ from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_misfit
 
 # All our choice, tried in the two rooms for tuning.
-_N_POINTS = 300_000  # random pixels are drawn; those that show a plane are used
+_N_POINTS = 300_000  # random pixels that are drawn; those that show a plane are used
 # Offsets (m) from a measured point along its normal, and so the signed distances that the map shall
 # have there. The surface must come first: `corrected` relies on it. The others lie within a voxel,
 # since surfaces are flat only nearby.
 _OFFSETS = (0.0, -0.03, -0.015, 0.015, 0.03)
-# Large scenes get more points, until cells with points have so many on average, or `_MAX_TIMES` as
-# many are drawn. Three rooms have 11 to 14; an office of 10 by 11 m has 2.8 (docs/tried.md).
+# More pixels are drawn in large scenes, until cells with points have so many on average, but at
+# most `_MAX_TIMES` as many. Without more pixels three rooms have 11 to 14 points a cell, and an
+# office of 10 by 11 m has 2.8 (docs/tried.md).
 _POINTS_A_CELL = 10
-_MAX_TIMES = 4  # at most so many times `_N_POINTS` pixels are drawn
+_MAX_TIMES = 4
 # The smallest robust scales of a tracker's residuals (distance in m, luma) are so many times the
 # median residual that the corrected map leaves at measured points, and at least `_MIN_SCALES`.
 # Chosen in the rooms for tuning, whose medians are 1.8 mm and 0.002, and on a real recording, whose
@@ -67,7 +68,7 @@ class CorrectedField(BakedField):
     form = "corrected"
 
     def __init__(self, source: Field, voxel: float) -> None:
-        """Sample a field as `BakedField` does. The grid is uncorrected until `add` is called."""
+        """Sample the field `source` in cells of `voxel` (m). `add` then corrects the grid."""
         super().__init__(source, voxel)
         self.name = source.name
         self.label = f"{source.label} corrected"
@@ -82,14 +83,15 @@ class CorrectedField(BakedField):
         # A point is an inlier within 2.5 cm of the surface.
         self.accuracy = Accuracy(tuple(scales.tolist()), 0.025, float(medians[1]))
         self.viewpoints = Viewpoints(self.cameras.double().numpy(), self.views)
-        self.volume[4] = _UNMEASURED  # the channel of confidence
+        # Channel 4 is the confidence, to which corrections add what was measured.
+        self.volume[4] = _UNMEASURED
         self.volume[:, self.numbers.long()] += self.corrections.float().T
 
     @classmethod
     def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> Self:
-        """Read the field as mapped from a map file, then sample and correct it anew.
+        """The corrected field of a map file: its learned field is sampled and corrected anew.
 
-        `made["correction"]` is the voxel (m), which `correct_map` wrote.
+        `made`, the record of the map, has the voxel (m) as "correction": `correct_map` wrote it.
         """
         source = {n.removeprefix(_SOURCE): x for n, x in state.items() if n.startswith(_SOURCE)}
         mapped = field_class(made["field"]).from_state(source, made, bounds)
@@ -100,10 +102,11 @@ class CorrectedField(BakedField):
 
 @usual_modes()
 def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
-    """Correct a map, in cells of `voxel` (m), by the frames that it was made from: see `corrected`.
+    """Correct a map in cells of `voxel` (m) by its mapped frames, as `corrected` does.
 
-    The record of the new map has the time that the correction took, the memory (bytes) of network
-    and correction, and the misfit of the corrected map.
+    `sequence` must be the one that was mapped. The record of the new map has the time that the
+    correction took, the memory (bytes) of network and correction, and the misfit of the corrected
+    map. Raises what `corrected` raises.
     """
     start = time.perf_counter()
     mapped, _ = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])
@@ -122,8 +125,8 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
 
     At a measured point p with normal n, the interpolated distance at p + s n shall be s for five
     offsets s. The colour at p shall be that of the pixel; off the surface no camera saw a colour.
-    These equations, weighted by 1 / depth^2, are linear in the corrections of vertices: see
-    `solve`. Raises DataError if no frame shows a plane, and ConfigError for a density.
+    These equations have the weight 1 / depth^2, and are linear in the corrections of vertices.
+    `solve` finds these. Raises DataError if no frame shows a plane, and ConfigError for a density.
     """
     if not field.is_distance:
         raise ConfigError(f"{field.label} is no signed distance: only such a map can be corrected")
@@ -137,16 +140,16 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     uncorrected = grid.volume[:4].T.double().numpy()[numbers]
     color_before, distance_before = uncorrected[:, :3], uncorrected[:, 3:]
     reliability = (depth.mean() / depth) ** 2
-    wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ distance_before  # changes, m
+    wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ distance_before  # corrections, m
     reliabilities = np.tile(reliability, len(_OFFSETS))
-    # Residuals above 1 cm are down-weighted.
+    # Residuals above 0.01 m, and below above 0.05 in colour, are down-weighted.
     distance, diagonal = solve(matrix, wanted, reliabilities, regularisation, 0.01, rounds=4)
     # The share of the Hessian's diagonal that comes from measurements, not from regularisation.
     confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)
 
     at_surface = matrix[:n_points]  # the rows of the first offset, which is 0
     wanted_color = seen_color - at_surface @ color_before
-    # Colours change faster from vertex to vertex: a tenth of the regularisation.
+    # A tenth of the regularisation, since colours change faster from vertex to vertex.
     color, _ = solve(at_surface, wanted_color, reliability, 0.1 * regularisation, 0.05, rounds=3)
 
     distance_residuals = wanted[:n_points] - at_surface @ distance
@@ -160,7 +163,7 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
 
 
 def _views(sequence: RgbdSequence, frames: Frames) -> State:
-    """The tensors `cameras` and `views` of a correction: see `CorrectedField`."""
+    """The tensors `cameras` and `views` that `CorrectedField` explains, from mapped frames."""
     kept = frames[spread_out(sequence.T_world_camera[frames])]
     views = torch.stack([view_of(sequence[index]) for index in kept.tolist()])
     return {"cameras": torch.from_numpy(sequence.T_world_camera[kept]).float(), "views": views}
@@ -172,11 +175,12 @@ def _measured_planes(
     """Random measured points whose tangent plane is known, ordered by the grid's cells.
 
     Returns points (n x 3, m, world), their planes' normals (n x 3), z-depths (n, m) and colours
-    (n x 3, in [0, 1]). The order keeps vertices that neighbours share in the processor's cache.
+    (n x 3, in [0, 1]). By their order, vertices that neighbours share stay in the processor's
+    cache.
 
-    The points come from `_N_POINTS` random pixels. If fewer than `_POINTS_A_CELL` of them lie in a
-    cell on average, as in a large scene, all are drawn anew from more pixels, at most `_MAX_TIMES`
-    as many.
+    The points come from `_N_POINTS` random pixels. If cells with points have fewer than
+    `_POINTS_A_CELL` on average, as in a large scene, all are drawn anew from more pixels, at most
+    `_MAX_TIMES` as many.
     """
     planes, cells = _drawn_planes(sequence, frames, grid, _N_POINTS)
     times = min(_POINTS_A_CELL * len(np.unique(cells)) / len(cells), _MAX_TIMES)
@@ -191,7 +195,7 @@ def _drawn_planes(
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """The four arrays of `_measured_planes` from `n_pixels` random pixels, and the points' cells.
 
-    Pixels without a known tangent plane are left out. DataError if there is no other.
+    Pixels without a known tangent plane are left out. Raises DataError if none is left.
     """
     sampler, generator = PixelSampler(sequence, torch.device("cpu")), torch.Generator()
     mapped = torch.from_numpy(frames)
@@ -200,10 +204,10 @@ def _drawn_planes(
     low, high = grid.low, grid.low + grid.voxel * (ends.new_tensor(grid.n_vertices) - 1)
     # The grid has no values for points outside, such as a facade seen through a window.
     is_inside = ((ends >= low) & (ends <= high)).all(dim=1)
-    has_plane = rays.normals_world.any(dim=1) & is_inside
-    if not has_plane.any():
+    is_used = rays.normals_world.any(dim=1) & is_inside  # an unknown normal is 0
+    if not is_used.any():
         raise DataError(f"{sequence.name} shows no surface to correct a map by: check its depth")
     drawn = ends, rays.normals_world, rays.depth, rays.color
-    planes = [part[has_plane].double().numpy() for part in drawn]
+    planes = [part[is_used].double().numpy() for part in drawn]
     vertices, _ = interpolation(planes[0], grid)
     return planes, vertices[:, 0]  # the number of a cell is that of its lowest vertex

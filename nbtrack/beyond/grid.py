@@ -26,7 +26,7 @@ _BYTES_PER_VERTEX = 4 * (3 + 1 + 1)  # colour, value and confidence
 
 
 class Accuracy(NamedTuple):
-    """The usual residuals of a map at surfaces: errors of the map and of depth cameras together.
+    """How large residuals at surfaces usually are, by errors of a map and of depth cameras.
 
     The defaults are for small networks whose residuals were not measured (our choice).
     """
@@ -53,9 +53,9 @@ class BakedField(Field):
     def __init__(self, source: Field, voxel: float | int) -> None:
         """Sample a field, on its device, at the vertices of cells of `voxel` (m).
 
-        The grid extends one cell beyond the bounds at each side. A voxel of half the size divides
-        the interpolation's error by four, and multiplies the memory (20 bytes a vertex) and the
-        time by eight. Raises ConfigError unless the voxel is positive and the grid fits in 0.5 GB.
+        The grid extends one cell beyond the bounds at each side. With half the voxel the error of
+        interpolation is a quarter, and the memory (20 bytes a vertex) and the time are eight times
+        as much. Raises ConfigError unless the voxel is positive and the grid fits in 0.5 GB.
         """
         super().__init__(source.bounds)
         self.label = f"{source.label} baked"
@@ -79,7 +79,7 @@ class BakedField(Field):
     def forward(self, points_world: Points) -> tuple[Colors, Values]:
         """Colour in [0, 1] and value at points (m, world frame), differentiable.
 
-        The value is that of the sampled field: a signed distance in m, for example.
+        The value means what it means in the sampled field, such as a signed distance (m).
         """
         values = self.channels(points_world)
         return values[:3].T, values[3]
@@ -91,7 +91,7 @@ class BakedField(Field):
         """
         volume = self.volume.view(5, *self.n_vertices)
         values = trilinear(volume, self.low, self.voxel, points_world)
-        # `trilinear` gives NaN the values of the border.
+        # At a position that is NaN, `trilinear` returns values of the border.
         return torch.where(points_world.isnan().any(dim=1), torch.nan, values)
 
 

@@ -132,9 +132,10 @@ class IcpTracker(Tracker):
         return self.small_gicp.align(self.target, self.source, self.target_tree, T_start, **options)
 
     def _distances(self, T_world_camera: Pose) -> Float[np.ndarray, "n"]:
-        """Distances (m) of the frame's points, at a pose, from the planes of the map's points.
+        """Distances (m) of the frame's points, at a pose, from planes of the map.
 
-        The nearest map point counts. The distance is infinite if none lies within `_NARROW`.
+        A point's plane is that of the nearest map point. Its distance is infinite if no map point
+        lies within `_NARROW`.
         """
         points_world = (self.source.points() @ T_world_camera.T)[:, :3]
         tree = self.field.tree
@@ -149,28 +150,29 @@ class IcpTracker(Tracker):
     def report(self) -> dict[str, float | bool]:
         """The share of inliers, the position's standard deviation (m), and whether it is lost.
 
-        A frame is lost if fewer than half of its points are inliers, or if they fit as well at a
-        wrong position. This verdict is no part of ICP, and its time is no part of a frame's.
+        A frame is lost if fewer than half of its points are inliers, or if it is likely that they
+        fit as well at a wrong position. This verdict is no part of ICP, and its time is no part of
+        a frame's.
         """
         if self.found is None:
             return {"inlier_ratio": 0.0, "lost": True}
         T_found = self.found.T_target_source
         distances = self._distances(T_found)
-        # m. The lower limit is how far the mean points of voxels scatter about a surface.
+        # m. At least 5 mm: so far the mean points of voxels scatter about a surface.
         scale = max(MAD_FACTOR * np.median(distances[np.isfinite(distances)]), 0.005)
 
         # Geman and McClure's cost, in a form that is 1, and not NaN, at an infinite distance.
         def costs_at(T_world_camera: Pose) -> Float[np.ndarray, "n"]:
             return 1 - 1 / (1 + (self._distances(T_world_camera) / scale) ** 2)
 
-        # small_gicp's Hessian is for twists in the camera's frame, `std_when_moved` takes them with
-        # world axes: rotation and translation are both rotated.
+        # small_gicp's Hessian is for twists with the camera's axes. `std_when_moved` takes twists
+        # with world axes, so that both halves, rotation and translation, are rotated.
         R_twist = np.kron(np.eye(2), T_found[:3, :3])
         H_world = R_twist @ self.found.H @ R_twist.T
         covariance = np.linalg.inv(H_world + PRIOR_WEIGHT * np.eye(6))
         # Distances from planes do not hold a camera along a flat wall, so that two directions are
-        # tried. With 256 independent points a third to a half of the wrong poses before such a wall
-        # passed (docs/tried.md).
+        # tried. Taking 256 points for independent, a third to a half of the wrong poses before such
+        # a wall were taken for right (docs/tried.md).
         position_std_m = std_when_moved(costs_at, T_found, covariance, 2, n_independent=128)
         inlier_ratio = self.found.num_inliers / self.source.size()
         is_held = p_within(CORRELATED * position_std_m) > 0.5

@@ -20,16 +20,16 @@ _SMOOTHNESS = 0.1  # of the squared difference between neighbouring corrections
 _PULL = 0.1  # of a squared correction: it is pulled to zero
 Columns = Float[np.ndarray, "rows columns"]
 Vertices = Int[np.ndarray, "points 8"]
-Corners = Float[np.ndarray, "points 8"]
+Weights = Float[np.ndarray, "points 8"]
 Mask = Bool[np.ndarray, "x y z"]
 _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T  # offsets of a cell's corners, 8 x 3; z is fastest
 
 
-def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices, Corners]:
-    """The eight vertices of the cells that contain points (m), and their trilinear weights.
+def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices, Weights]:
+    """The eight vertices of each point's cell, and the vertices' weights in its interpolation.
 
-    Vertices are given by their row-major numbers, the lowest corner first. Points outside of the
-    grid are moved to its border, as the grid itself does.
+    Points are in m. Vertices are given by their row-major numbers, the lowest corner first. Points
+    outside of the grid are moved to its border, as the grid itself does.
     """
     shape = np.array(grid.n_vertices)
     scaled = (points_world - grid.low.double().numpy()) / grid.voxel
@@ -45,19 +45,19 @@ def interpolation(points_world: WorldPoints, grid: BakedField) -> tuple[Vertices
 
 
 def corrected_vertices(
-    vertices: Vertices, weights: Corners, shape: tuple[int, ...]
+    vertices: Vertices, weights: Weights, shape: tuple[int, ...]
 ) -> tuple[Mask, csr_array]:
     """A mask of the grid's vertices to correct, and the interpolation matrix A from them to points.
 
-    `vertices` and `weights` are those of `interpolation`, and `shape` is the grid's. Corrected are
-    the vertices of cells with points, and their neighbours. If x holds a value for each of these n
-    vertices, A x (A is points x n) holds the interpolated values at the points.
+    `vertices` and `weights` are those of `interpolation`, and `shape` is the grid's. The vertices
+    of cells with points are corrected, and so are their neighbours. If x holds a value for each of
+    these n vertices, A x (A is points x n) holds the interpolated values at the points.
     """
     has_points = np.zeros(shape, dtype=bool)
     has_points.flat[vertices] = True
     is_corrected = binary_dilation(has_points)  # by one vertex, over which corrections fade out
-    column_of = is_corrected.cumsum() - 1  # by a vertex's number, if it is corrected
-    # Data, column indices, and row pointers of eight entries a row.
+    column_of = is_corrected.cumsum() - 1  # the column of A, by the number of a corrected vertex
+    # The sparse matrix: its entries, their columns, and where its rows of eight entries begin.
     entries = (weights.ravel(), column_of[vertices].ravel(), np.arange(0, weights.size + 1, 8))
     return is_corrected, csr_array(entries, shape=(len(weights), column_of[-1] + 1))
 
@@ -66,8 +66,9 @@ def regularisation_of(is_corrected: Mask) -> tuple[Int[np.ndarray, "n"], csr_arr
     """Row-major numbers of the n vertices to correct, and a matrix R (n x n) that regularises them.
 
     x' R x is the regularisation loss of corrections x: `_PULL` times the sum of their squares, plus
-    `_SMOOTHNESS` times the sum of the squared differences between neighbours. A vertex has six, and
-    those that are not corrected count as zero, so that corrections fade out.
+    `_SMOOTHNESS` times the sum of the squared differences between neighbours. A vertex has six
+    neighbours. The correction of a neighbour that is not corrected is 0, so that corrections fade
+    out.
     """
     adjacency, numbers = pixel_graph(is_corrected, connectivity=1)  # 1 between neighbours
     diagonal = eye_array(len(numbers)) * (_PULL + 6 * _SMOOTHNESS)
@@ -90,8 +91,8 @@ def solve(
 
     Iteratively reweighted least squares: each of the `rounds` computes the weights at the solution
     so far, and solves by conjugate gradients from there. The Hessian A'WA + R is applied to
-    vectors, and never formed: to sum up its entries would take longer. Its diagonal
-    is returned for the weights of the last round.
+    vectors, and never formed: to sum up its entries would take longer. Its diagonal is returned for
+    the weights of the last round.
     """
     solution = np.zeros((matrix.shape[1], wanted.shape[1]))
     squares = matrix.power(2)

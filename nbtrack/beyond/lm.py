@@ -31,15 +31,15 @@ _WIDE_SCALES = np.array([0.1, 0.2])
 # starts do not show which one leads to the true pose. A fast camera that may have stopped has such
 # starts.
 _FAR_APART = 0.06
-_LOST = 0.5  # a pose is lost if the probability that it is wrong is at least this
-_DOUBTFUL = 0.1  # a pose is in doubt if that probability is at least this: other descents follow
-# The first descent counts as at most so many steps: the last of them does all that is left. Each
-# descent from another start counts as one step.
-_MAX_FOLLOWING = 20
-# If a map has views, a lost camera is searched for at the poses of the most similar views and at
-# random poses. A few steps are taken from each, and descents follow from there, cheapest first.
-_TRIED = 20  # most similar views; and as many random poses
-_RANDOM = 1000  # random poses are drawn, and those with the lowest cost are tried
+_LOST = 0.5  # a frame is lost if its pose is wrong with at least this probability
+_DOUBTFUL = 0.1  # a pose is in doubt if it is wrong with at least this probability
+# The first descent counts as at most so many steps. The last of them does whatever is left of it.
+_MAX_FIRST_STEPS = 20
+# If a map has views, a lost camera is searched for at the poses of the `_TRIED` most similar views,
+# and at the cheapest `_TRIED` of `_RANDOM` random poses. A few steps are taken from each, and
+# descents follow from there, the cheapest first.
+_TRIED = 20
+_RANDOM = 1000
 
 
 @dataclass(frozen=True)
@@ -60,12 +60,13 @@ class LmTracker(Tracker):
     It works on a grid on the host. Other fields with a signed distance are sampled once, in cells
     of `settings.voxel`. A frame is tracked as follows:
 
-    1. A descent begins at the best start: of those of the motion model and, after a lost frame, the
-       last good pose. They are compared by their costs, or, if they are far apart, by the costs
-       after their coarse stages, which count as no step.
-    2. If the resulting pose is in doubt, other descents follow while the budget lasts, each as one
-       step: from the last good pose and around it, or, if the map has views, from the poses of
-       similar views. A pose that explains the frame clearly better replaces the one before.
+    1. A descent begins at the best start. The starts are those of the motion model and, after a
+       lost frame, the last good pose. They are compared by their costs. Starts that are far apart
+       are compared by the costs after their coarse stages, which count as no steps.
+    2. If the resulting pose is in doubt, other descents follow while the budget lasts. Each counts
+       as one step. They begin at the poses of similar views if the map has views, else at the last
+       good pose and around it. A pose that explains the frame clearly better replaces the one
+       before.
 
     A frame with too few points keeps the motion model's first start.
 
@@ -87,9 +88,9 @@ class LmTracker(Tracker):
         baked = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
         on_host = baked.cpu()
         self.grid = grid_of(on_host)
-        # A descent on one point compiles all functions, or loads them, before any result depends on
-        # them: inner ones before those that call them. Otherwise the process that compiles would
-        # round sums in another way than later processes.
+        # A descent on one point compiles all functions, or loads them from the disk, before any
+        # result depends on them, and inner functions before those that call them. Otherwise the
+        # process that compiles them would round sums in another way than later processes.
         any_point = Observed(np.zeros((1, 3)), np.zeros(1), np.empty((0, 3)))
         LmOptimizer(self.grid, any_point, any_point, 1.0, T_start=np.eye(4)).certainty()
         return on_host
@@ -115,12 +116,13 @@ class LmTracker(Tracker):
         if self.was_lost and self.last_good is not None:
             starts = np.concatenate([starts, self.last_good.numpy()[None]])
         starts = rigid(starts)
-        # Poses near which the camera should be: `innovation` is the distance from them. The motion
-        # model's starts mean little after a lost frame. Then it is the last good pose, if any.
+        # The poses near which the camera should be; `innovation` is the distance from them. They
+        # are the motion model's starts. After a lost frame these mean little, and the last good
+        # pose, if there is one, takes their place.
         self.trusted = starts[n_expected:] if self.was_lost else starts[:n_expected]
         self.T_start = starts[0]
-        self.best = None
-        self.remaining_steps = iter(())  # no steps, if the frame has too few points
+        self.best = None  # the descent whose pose is the estimate
+        self.remaining_steps = iter(())  # none, unless the frame has enough points
         observed = draw_points(frame, self.settings.n_pixels, self.generator)
         n_points = len(observed.points)
         self.is_converged = n_points < _MIN_POINTS
@@ -131,19 +133,21 @@ class LmTracker(Tracker):
         # A picture without contrast is dark, covered or overexposed: its intensities are not used.
         has_contrast = observed.intensity.std() > 0.01
         self.intensity_weight = self.settings.lambda_intensity if has_contrast else 0.0
-        # A function that takes a start, and returns the descent for this frame's pose from there.
+        # `descent_from(T)` begins a descent for this frame's pose at the start T.
         self.descent_from = partial(LmOptimizer, self.grid, coarse, observed, self.intensity_weight)
         descents = [self.descent_from(T) for T in starts]
         if np.abs(starts - starts[0]).max() > _FAR_APART:
             for descent in descents:
                 descent.run_stage(max_steps=30)
         self.best, *_ = _by_cost(descents)
-        # The last one of the motion model's starts is the previous pose, unless the model is
-        # constant velocity alone.
+        # The last start of the motion model: the previous pose, or that of constant velocity.
         self.remaining_steps = self._steps(frame, T_expected=starts[n_expected - 1])
 
     def step(self) -> float:
-        """One step of Levenberg-Marquardt, or one descent elsewhere; returns the cost before it."""
+        """Take a step of the first descent, or do a whole other descent.
+
+        Returns the robust cost before it, and NaN if no step is left.
+        """
         return next(self.remaining_steps, float("nan"))
 
     @property
@@ -152,11 +156,14 @@ class LmTracker(Tracker):
         return torch.from_numpy(self.T_start if self.best is None else self.best.T_world_camera)
 
     def report(self) -> dict[str, float | bool]:
-        """Numbers of `LmOptimizer.certainty` and `p_lost`, and the verdict whether it is lost."""
+        """The probability that the pose is wrong, the verdict `lost`, and the numbers behind both.
+
+        `verdict` and `LmOptimizer.certainty` explain the numbers.
+        """
         if self.best is None:
             return {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}
         numbers = self.best.certainty()
-        # At least the median error of intensities that are rounded to 256 grey levels: a quarter.
+        # At least a quarter of a grey level: the median error of rounding to 256 levels.
         usual_mad = max(self.field.accuracy.intensity_mad, 0.25 / 255)
         innovations = _apart(self.trusted, self.best.T_world_camera)
         ratio = numbers["intensity_mad"] / usual_mad
@@ -169,38 +176,38 @@ class LmTracker(Tracker):
     def _steps(self, frame: Frame, T_expected: Pose) -> Iterator[float]:
         """Do the steps of the best descent, then other descents while its pose is in doubt.
 
-        Yields, after each step or descent, the cost before it. Before it yields the last cost it
-        sets `is_converged`, so that the caller asks for no more. `T_expected` is where the camera
-        may be if no frame was good yet.
+        After each step or descent the robust cost before it is yielded. `is_converged` is set
+        before the last cost is yielded, so that the caller asks for no more. `T_expected` is where
+        other descents begin if no frame was good yet.
         """
         cost = self.best.step()
-        for _ in range(_MAX_FOLLOWING - 1):
+        for _ in range(_MAX_FIRST_STEPS - 1):
             if self.best.is_finished:
                 break
             if self.best.is_ended:
                 self.best.refine()
             yield cost
             cost = self.best.step()
-        self.best.run()  # what is left of it, if anything, counts with the last of these steps
+        self.best.run()  # whatever is left of this descent belongs to the last of its steps
         if self.settings.n_restarts and self.report()["p_lost"] >= _DOUBTFUL:
             yield cost
             others = self._other_starts(frame, T_expected)
             for n_tried, T_start in enumerate(others, start=1):
                 cost = self.best.cost(NEAR_SCALES)
                 is_confirmed = self._descend_from(T_start)
-                # A confirmed pose ends the descents if it is not lost, another one if it is not in
-                # doubt.
-                max_p_lost = _LOST if is_confirmed else _DOUBTFUL
-                if n_tried == len(others) or not self.report()["p_lost"] >= max_p_lost:
+                # The descents end if the pose is not in doubt. If two of them have found it, they
+                # end already if it is not lost.
+                enough = _LOST if is_confirmed else _DOUBTFUL
+                if n_tried == len(others) or self.report()["p_lost"] < enough:
                     break
                 yield cost
         self.is_converged = True
         yield cost
 
     def _descend_from(self, T_start: Pose) -> bool:
-        """Run a whole descent, which becomes the best one if its pose is clearly better.
+        """Run a whole descent from a start. It becomes the best one if its cost is clearly lower.
 
-        Returns whether it ended at the same pose as the best one so far, which confirms that pose.
+        Returns whether it confirms the pose of the best descent so far: it ended at the same pose.
         """
         other, best_so_far = self.descent_from(T_start), self.best
         other.run()
@@ -211,28 +218,26 @@ class LmTracker(Tracker):
     def _other_starts(self, frame: Frame, T_expected: Pose) -> list[Pose]:
         """Poses at which descents may begin after the first one, the likeliest first.
 
-        If the map has views, they are those of `_starts_by_views`. Otherwise they are the last good
-        pose, or `T_expected` if there is none yet, and turns of that pose. At most `n_restarts` are
-        returned, or all if no pose is trusted.
+        With views in the map they are those of `_starts_by_views`. Otherwise they are the last good
+        pose, or `T_expected` if there is none yet, and this pose turned about its centre. At most
+        `n_restarts` are returned, but all if no pose is trusted, since the camera may be anywhere.
         """
         anchor = T_expected if self.last_good is None else self.last_good.numpy()
         if self.field.viewpoints is None:
-            # The anchor, and then the anchor turned about x, y and z both ways, by growing angles.
+            # The anchor is turned about x, y and z, both ways, by growing angles. The twist of a
+            # turn has the rotation vector (rad) in its first three numbers.
             angles = 0.2 * np.arange(1, self.settings.n_restarts)  # rad
             turns = product(angles, np.eye(6)[:3], (1, -1))
-            starts = [
-                anchor,
-                *(retract(anchor, angle * axis * sign) for angle, axis, sign in turns),
-            ]
+            starts = [anchor, *(retract(anchor, way * angle * axis) for angle, axis, way in turns)]
         else:
             starts = self._starts_by_views(frame, anchor, self.field.viewpoints)
         return starts[: self.settings.n_restarts] if len(self.trusted) else starts
 
     def _starts_by_views(self, frame: Frame, anchor: Pose, viewpoints: Viewpoints) -> list[Pose]:
-        """Poses after a few steps from several starts, those with the lowest cost first.
+        """Poses after a few steps from several starts, the pose with the lowest cost first.
 
-        The starts are the anchor, the poses whose views are most similar to the frame's, and those
-        of many random poses that have the lowest costs.
+        The starts are the anchor, the poses whose views are most similar to the frame's, and the
+        cheapest ones of many random poses.
         """
         alike = retrieve(view_of(frame), viewpoints, _TRIED)
         random = [self.descent_from(T) for T in self._random_poses(viewpoints.T_world_camera)]
@@ -242,10 +247,11 @@ class LmTracker(Tracker):
         return [descent.T_world_camera for descent in _by_cost(tried)]
 
     def _random_poses(self, T_world_camera: Poses) -> Poses:
-        """Random poses near known ones, turned by any angle about the vertical.
+        """Random poses near known poses, turned by any angle about the vertical.
 
         The vertical is the mean of the known poses' y axes.
         """
+        # The seed comes from the tracker's generator, so that a resumed run draws the same poses.
         random = np.random.default_rng(int(torch.randint(2**62, (), generator=self.generator)))
         poses = T_world_camera[random.integers(len(T_world_camera), size=_RANDOM)]
         down = T_world_camera[:, :3, 1].mean(axis=0)

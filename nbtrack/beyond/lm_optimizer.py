@@ -10,8 +10,8 @@ from nbtrack.beyond.verdict import MAD_FACTOR, SIGMAS, std_when_moved
 from nbtrack.core.arrays import Pose
 
 _MAX_DAMPING = 1e3  # a larger damping ends a stage
-# Robust scales (m, luma) at which the poses of finished descents are compared, and the pose after a
-# coarse stage with its start, since that stage may end at a worse pose.
+# Robust scales (m, luma) at which poses are compared: those of finished descents with each other,
+# and the pose after a coarse stage with the start, since a coarse stage may end at a worse pose.
 NEAR_SCALES = np.array([0.02, 0.05])
 # Far from the pose only distances are used: the basin of intensities is as narrow as the texture.
 COARSE = Stage(is_fine=False, mad_factor=10.0, min_step=1e-2)
@@ -37,15 +37,15 @@ class LmOptimizer:
         self.last_step = np.inf  # the last twist's largest component (rad or m)
         self.fine_problem = Problem(fine, grid, FINE, lambda_intensity, T_start)
         self._begin_stage(Problem(coarse, grid, COARSE, lambda_intensity=0.0, T_start=T_start))
-        self._start_cost = self.cost(NEAR_SCALES)  # of the coarse points, at the start
+        self._start_cost = self.cost(NEAR_SCALES)  # of the points `coarse`, at the start
 
     def step(self) -> float:
         """Try one step, which is taken or refused; returns the robust cost before it."""
-        now = self.problem, self.T_world_camera, self.terms, self.scales, self.damping, self.twist
-        is_better, self.T_world_camera, self.terms, self.twist, self.last_step, cost_before = (
-            lm_solver.try_step(*now)
+        state = self.problem, self.T_world_camera, self.terms, self.scales, self.damping, self.twist
+        is_taken, self.T_world_camera, self.terms, self.twist, self.last_step, cost_before = (
+            lm_solver.try_step(*state)
         )
-        if is_better:
+        if is_taken:
             self._narrow_scales()
             self.damping = max(0.2 * self.damping, 1e-9)
         else:
@@ -62,7 +62,7 @@ class LmOptimizer:
             self.step()
 
     def refine(self) -> None:
-        """Begin the fine stage, where the coarse one ended, or at the start if that costs less."""
+        """Begin the fine stage where the coarse one ended, or at the start if this costs less."""
         if self.cost(NEAR_SCALES) > self._start_cost:
             self.T_world_camera = self.problem.T_start
         self._begin_stage(self.fine_problem)
@@ -92,20 +92,20 @@ class LmOptimizer:
 
         - `inlier_ratio`: the share of points that are inliers in distance and intensity;
         - `known_ratio`: the mean reliability of the points;
-        - `fitting_ratio`: the share of inliers if points count by their reliability, since points
-          of what was not mapped fit at no pose;
+        - `fitting_ratio`: the share of inliers among points that are weighted by their reliability,
+          since points of what was not mapped fit at no pose;
         - `intensity_mad`: the median absolute deviation of the intensity residuals from their
           median; 0 if intensities have no weight;
         - `position_std_m`: the position's standard deviation.
         """
         distance, intensity = self.terms.residuals
         reliability = self.terms.reliability
+        has_weight = self.fine_problem.lambda_intensity > 0
         # The median is subtracted, since a picture that is darker as a whole is no sign of a wrong
         # pose.
-        has_weight = self.fine_problem.lambda_intensity > 0
         off = np.abs(intensity - _median(intensity)) if has_weight else np.zeros_like(intensity)
         is_near = np.abs(distance) < self.problem.grid.accuracy.inlier_distance
-        is_inlier = is_near & (reliability > 0) & (off < 0.25)  # luma is in [0, 1]
+        is_inlier = is_near & (reliability > 0) & (off < 0.25)  # luma in [0, 1]; our choice
         known_ratio = float(reliability.mean())
         return {
             "inlier_ratio": float(is_inlier.mean()),
@@ -118,16 +118,16 @@ class LmOptimizer:
     def _position_std_m(self) -> float:
         """The position's standard deviation (m) along its least certain direction.
 
-        It is the larger one of two estimates: by the curvature of the cost, and by
-        `std_when_moved`. It is a lower bound, since residuals are taken to be independent, and a
-        map's errors are not.
+        It is the larger one of two estimates: one by the curvature of the cost, the other by
+        `std_when_moved`. The true one is larger still, since residuals are taken to be independent,
+        and a map's errors are not.
         """
         H, _ = lm_solver.normal_equations(self.terms, self.scales, self.problem.lambda_intensity)
         # In rad and m. H is in units of the robust scales, which are `SIGMAS` standard deviations.
         covariance = np.linalg.inv(H + lm_solver.PRIOR_WEIGHT * np.eye(6)) / SIGMAS**2
         by_curvature = np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:]).max())
-        # With more independent points, 384 or 512, some wrong poses before a flat wall passed
-        # (docs/tried.md).
+        # Taking 384 or 512 points for independent, some wrong poses before a flat wall were taken
+        # for right (docs/tried.md).
         pose = self.T_world_camera
         moved_std_m = std_when_moved(self._costs_at, pose, covariance, 1, n_independent=256)
         return float(max(by_curvature, moved_std_m))
@@ -142,7 +142,7 @@ class LmOptimizer:
         self.problem = problem
         self.damping = 1e-4
         self.is_ended = False
-        self.twist = np.zeros(6)  # of the last step
+        self.twist = np.zeros(6)  # of the last step that was taken; 0 before any
         self.terms = residual_terms(problem, self.T_world_camera)
         self.scales = np.full(2, np.inf)  # `_narrow_scales` can only reduce them
         self._narrow_scales()

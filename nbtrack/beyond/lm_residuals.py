@@ -36,7 +36,8 @@ from nbtrack.core.arrays import Pose
 G_MIN = 0.3
 G_MAX = 2.0
 G_SCALE = 0.5
-MARGIN = 0.3  # m; points so far outside of the bounds are used: walls lie there if the pose is off
+# m. Points up to so far outside of the bounds are used: walls lie there while the pose is off.
+MARGIN = 0.3
 ONE = np.float32(1)
 ZERO = np.float32(0)
 
@@ -114,8 +115,9 @@ def residual_terms(problem: Problem, T: Pose) -> Terms:
     for i in range(n_points):
         v, x, y, z = np.uintp(cells[i]), in_cell[0, i], in_cell[1, i], in_cell[2, i]
         for k in range(3 if problem.stage.is_fine else 2):  # distance, intensity, confidence
-            # Trilinear interpolation. c011 is the value at the corner of the cell that is low in x
-            # and high in y and z. c01 is interpolated along z, and c0 along y as well.
+            # Trilinear interpolation. The digits are of x, y and z, 0 for the low side of the cell:
+            # c011 is at the corner with low x, high y and high z. c01 is interpolated along z, and
+            # c0 along z and y.
             c000, c001 = vertices[v, k], vertices[v + step_z, k]
             c010, c011 = vertices[v + step_y, k], vertices[v + step_y + step_z, k]
             c100, c101 = vertices[v + step_x, k], vertices[v + step_x + step_z, k]
@@ -180,8 +182,8 @@ def _locate(points: Array, T: Pose, grid: Grid) -> tuple[Array, ...]:
 def _weigh(terms: Terms, normals: Array, T: Pose) -> None:
     """Complete the terms in place.
 
-    Reliabilities are multiplied by the factors of the gradient norm g and, if there are normals, of
-    these. Distances and their gradients are divided by g.
+    Distances and their gradients are divided by the gradient norm g. Reliabilities are multiplied
+    by the factor of g and, if the points have normals, by that of the normals.
     """
     gradient = terms.gradients[0]
     for i in range(len(terms.reliability)):

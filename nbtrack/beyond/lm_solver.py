@@ -32,19 +32,19 @@ from nbtrack.core.arrays import Pose
 # The prior is as strong as one point at a twist of 0.5 rad or 0.5 m. It is so weak that it decides
 # only along directions in which the frame does not hold the pose, as along a corridor (our choice).
 PRIOR_WEIGHT = 1 / 0.5**2
-# Steps creep if the ratio of a step's length, along the last step, to that of the last one is above
-# _MIN_RATIO. Ratios above _MAX_RATIO count as _MAX_RATIO, which bounds the extrapolation.
+# Steps creep if a step, projected on the last one, is more than _MIN_RATIO times as long as the
+# last one. Ratios above _MAX_RATIO count as _MAX_RATIO, which bounds the extrapolation.
 _MIN_RATIO = 0.5
 _MAX_RATIO = 0.9
 
 
 def robust_scales(residuals: Array, before: Array, sigma: Array | tuple, factor: float) -> Array:
-    """Robust scales of distance (m) and intensity: `factor` times the median of each |residual|.
+    """Robust scales of distance (m) and intensity: `factor` times the medians of |residual|.
 
-    `residuals` are 2 x n. A scale is at least its `sigma`, and at most the one `before`. The
+    `residuals` are 2 x n. A scale is at least its `sigma`, and at most the scale `before`. The
     function is not compiled, since numpy's `partition` would take seconds to compile.
     """
-    # In most steps the scales cannot fall any more. Then the slow median is not computed.
+    # In most steps the scales are at their minimum. Then the slow median is not computed.
     if (before <= sigma).all():
         return before
     middle = (residuals.shape[1] - 1) // 2
@@ -57,9 +57,9 @@ def robust_scales(residuals: Array, before: Array, sigma: Array | tuple, factor:
 def robust_cost(
     residuals: Array, reliability: Array, scales: Array, lambda_intensity: float
 ) -> float:
-    """The mean cost of the points: the module's docstring has the equation.
+    """The mean cost of the points, by the equation in the module's docstring.
 
-    `residuals` are 2 x n, `reliability` is n, and `scales` are 2.
+    `residuals` (2 x n) and `scales` (2,) are of distance and intensity, `reliability` is (n,).
     """
     total, weight = 0.0, np.float32(lambda_intensity)
     per_scale_d, per_scale_i = np.float32(1 / scales[0]), np.float32(1 / scales[1])
@@ -82,7 +82,7 @@ def point_costs(terms: Terms, scales: Array, lambda_intensity: float) -> Array:
 @no_type_check
 @compiled
 def normal_equations(terms: Terms, scales: Array, lambda_intensity: float) -> tuple[Array, Array]:
-    """H (6 x 6) and b (6), in double precision: the module's docstring has the equations."""
+    """H (6 x 6) and b (6,) of the module's docstring, in double precision."""
     n_points = len(terms.reliability)
     jacobian, weights = np.empty((6, n_points), np.float32), np.empty(n_points, np.float32)
     matrix, vector = np.zeros((6, 6)), np.zeros(6)
@@ -133,7 +133,7 @@ def retract(T: Pose, twist: Array) -> Pose:
 @no_type_check
 @compiled
 def damped_step(problem: Problem, T: Pose, terms: Terms, scales: Array, damping: float) -> Array:
-    """The twist (6,) that solves the damped normal equations of data and prior."""
+    """The twist (6,) that solves the damped normal equations of residuals and pose prior."""
     matrix, vector = normal_equations(terms, scales, problem.lambda_intensity)
     for k in range(3):
         # sin(angle) axis is half of the differences Q_ij - Q_ji of the rotation Q = R R_start'.
@@ -145,8 +145,8 @@ def damped_step(problem: Problem, T: Pose, terms: Terms, scales: Array, damping:
         vector[3 + k] += PRIOR_WEIGHT * (T[k, 3] - problem.T_start[k, 3])
     for k in range(6):
         matrix[k, k] += PRIOR_WEIGHT + damping * matrix[k, k]
-    # Gaussian elimination: a positive definite matrix needs no pivots. The back substitution after
-    # it also changes the sign.
+    # Gaussian elimination, without pivots, since the matrix is positive definite. The substitution
+    # after it gives -vector / matrix: the right side has a minus.
     for k in range(6):
         for i in range(k + 1, 6):
             share = matrix[i, k] / matrix[k, k]
@@ -167,25 +167,25 @@ def try_step(
 ) -> tuple[bool, Pose, Terms, Array, float, float]:
     """Try a step from the pose `T`, whose terms are `terms`, and take it if it lowers the cost.
 
-    `last_twist` is the step before (0 at first). If steps creep, each hardly shorter than the last
-    one and in nearly the same direction, they are taken for a geometric series. Then its limit is
-    tried first (Aitken 1926), as far as `_MAX_RATIO` allows, and the step alone if the limit is no
-    better.
+    `last_twist` is the step that was taken before (0 at first). Steps creep if each is hardly
+    shorter than the last one and has nearly the same direction. They are then taken for a geometric
+    series: its limit is tried first (Aitken 1926), as far as `_MAX_RATIO` allows, and the step
+    alone if the cost at the limit is no lower.
 
-    In the fine stage, usable points keep the reliabilities from before the step in the cost after
-    it. Gradients of a grid jump from cell to cell, and reliabilities with them, although the pose
-    is no worse. In the coarse stage the new reliabilities count: far from the pose, a reliable
-    gradient is a sign that a surface is near.
+    In the fine stage, the cost after the step takes the reliabilities from before the step, and 0
+    for points that are not usable any more. For gradients of a grid jump from cell to cell, and
+    reliabilities with them, although the pose is no worse. In the coarse stage the new
+    reliabilities count: far from the pose, a reliable gradient is a sign that a surface is near.
 
-    Returns whether the step lowered the cost; the pose, the terms and the twist after it, or those
-    from before it if the cost is no lower; the largest component (rad or m) of the twist that was
+    Returns, in this order, whether the step is taken; the pose, the terms and the twist after it,
+    or those from before if it is not taken; the largest component (rad or m) of the twist that was
     tried; and the cost before the step.
     """
     twist = damped_step(problem, T, terms, scales, damping)
     before = robust_cost(terms.residuals, terms.reliability, scales, problem.lambda_intensity)
     along, square = (twist * last_twist).sum(), (last_twist * last_twist).sum()
-    # The ratio along / square is above _MIN_RATIO, and the angle between the twists is below 45
-    # degrees: cos^2 > 0.5.
+    # along / square is the ratio of lengths. The angle between the twists must be below 45 degrees,
+    # so that the square of its cosine is above 0.5.
     does_creep = along > _MIN_RATIO * square and along**2 > 0.5 * square * (twist * twist).sum()
     stride = 1 / (1 - min(along / square, _MAX_RATIO)) if does_creep else 1.0
     for factor in (stride, 1.0):

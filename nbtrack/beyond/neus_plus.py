@@ -26,27 +26,27 @@ from nbtrack.machinery.settings import limited
 _MIN_VOXEL = 0.05  # m; smallest voxel of the grid of observed distances
 _MAX_CELLS_A_SIDE = 128  # of that grid: larger scenes have larger voxels
 _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
-# m. The tangent plane is the nearest surface to a sample if the distance from it differs by less
-# from the distance to the nearest point. It is half a voxel of the points, and their rounding.
+# m. The tangent plane is the surface nearest to a sample if the distance from it differs by less
+# than this from the distance to the nearest point: by half a voxel of points, and their rounding.
 _PLANE_TOLERANCE = 0.015
 Flags = Bool[Tensor, "rays samples"]
 
 
 @dataclass(frozen=True)
 class NeusPlusMapping(NeusMapping):
-    """Mapping of NeuS+: half as many rays as NeuS, and measured points besides."""
+    """Settings of mapping with NeuS+: half as many rays as NeuS, and also measured points."""
 
     iterations: int = 10_000
     n_rays: int = limited(512, 1, 65536)
     lambda_color: float = 6.0
     eikonal_share: float = limited(0.125, 0.0, 1.0)
     lambda_sdf: float = 10.0  # 1/m; weight of the errors of the signed distance
-    n_surface_points: int = limited(4096, 1, 65536)  # measured points an iteration
+    n_surface_points: int = limited(4096, 1, 65536)  # measured points in each iteration
     lambda_rendering: float = 1.0  # factor of both rendering losses; 0: no rendering losses
 
 
 class NeuSPlusField(NeuSField):
-    """NeuS with signed-distance targets (m) besides: the paper's future work (Sec. IV)."""
+    """NeuS whose signed distances have targets (m), too: the paper's future work (Sec. IV)."""
 
     name = "neus_plus"
     label = "NeuS+"
@@ -90,19 +90,19 @@ def distance_targets(
     `nearest` is the distance (m) of samples from the nearest observed point, and `is_free` says
     whether a camera saw through them. There are two sources of a target:
 
-    - The tangent plane of the ray's pixel: the distance is (D - d) times the length of the ray's
-      direction times the cosine of incidence. It is exact if the surface is flat, and its noise
-      averages out. It is used in front of the ray's surface, and up to 10 cm behind it, where it
-      agrees with `nearest` to `_PLANE_TOLERANCE`. Behind the surface it is not used where a camera
-      saw through the sample, since thin things end there.
+    - The distance from the tangent plane of the ray's pixel: (D - d) times the length of the ray's
+      direction times the cosine of incidence, for the measured depth D and the sample's depth d. It
+      is exact if the surface is flat, and its noise averages out. It is used in front of the ray's
+      surface, and up to 10 cm behind it, if it agrees with `nearest` to `_PLANE_TOLERANCE`. Behind
+      the surface it is not used if a camera saw through the sample, since thin things end there.
     - The distance `nearest`. It is used elsewhere in front of the ray's surface, if this surface is
       more than `surface_band` (m of z-depth) away. Within a voxel of another surface it may be up
       to half a voxel too large, since it is interpolated.
 
     Farther behind the surface nothing is known.
 
-    Source: distances along the ray as iSDF (Ortiz et al. 2022), nearest points as its "pc" bounds,
-    but over all frames and not one batch; the choice between them is ours.
+    Source: iSDF (Ortiz et al. 2022) has distances along the ray, and nearest points as its "pc"
+    bounds, but of one batch and not of all frames. The choice between the two is ours.
     """
     before = rays.depth[:, None] - depths  # z-depth from a sample to the surface; negative behind
     # Distance from the plane for each metre of z-depth; 0 if the normal is unknown.
@@ -119,10 +119,10 @@ def distance_targets(
 class ObservedDistance:
     """A grid of unsigned distances from the observed surface, and of free space.
 
-    The grid covers the scene's bounds. A distance at its vertices is that from the nearest of the
-    fused points (means of measured points), by an exact Euclidean distance transform. Interpolated
-    distances are right to millimetres, except within a `voxel` of a surface. There
-    `distance_targets` uses tangent planes. A vertex is free if a camera saw through it.
+    The grid covers the scene's bounds. Its vertices have the distance from the nearest fused point
+    (a mean of measured points), by a Euclidean distance transform. Interpolated distances are right
+    to millimetres, except within a `voxel` of a surface. There `distance_targets` uses tangent
+    planes. A vertex is free if a camera saw through it.
     """
 
     def __init__(
@@ -136,23 +136,24 @@ class ObservedDistance:
         shape = np.ceil((high - low) / fine).astype(int) + 1
         n_pixels = sequence.intrinsics.width * sequence.intrinsics.height
         stride = max(1, round((n_pixels / _POINTS_PER_FRAME) ** 0.5))
-        # Fewer than three points of a cell are noise.
+        # One or two measured points in a cell are noise.
         cloud = fuse_points(sequence, frames, bounds, fine, stride, min_count=3)
         points = cloud.points.double().numpy()
         point_in = np.full(shape, -1)  # the index of each cell's point; -1 if it has none
         cells, inside = cells_of(points, low, shape, fine)
         point_in.flat[cells] = np.flatnonzero(inside)
-        # The nearest cell with a point, of each cell: its indices along x, y and z.
+        # For each cell the indices, along x, y and z, of the nearest cell with a point.
         place = distance_transform_edt(point_in < 0, return_distances=False, return_indices=True)
         x, y, z = place[:, ::2, ::2, ::2]
         nearest = points[point_in[x, y, z]]
-        # The vertices of the grid, m, world frame.
-        corners = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
-        distance = torch.from_numpy(np.linalg.norm(corners - nearest, axis=-1)).float()
-        corners_world = torch.from_numpy(corners.reshape(-1, 3)).float()
-        is_free = min_depth_behind(corners_world, sequence, frames) < -0.05  # m
+        # m, world frame; three indices in the grid, and x, y, z
+        vertices = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
+        distance = torch.from_numpy(np.linalg.norm(vertices - nearest, axis=-1)).float()
+        vertices_world = torch.from_numpy(vertices.reshape(-1, 3)).float()
+        # A camera saw through a vertex if it measured a surface at least 5 cm behind it.
+        is_free = min_depth_behind(vertices_world, sequence, frames) < -0.05
         self.values = torch.stack([distance, is_free.view(distance.shape).float()]).to(device)
-        self.low = corners_world[0].to(device)
+        self.low = vertices_world[0].to(device)
 
     def __call__(self, points_world: Float[Tensor, "rays samples 3"]) -> tuple[RaySamples, Flags]:
         """Distances (m) of points (m) from the observed surface, and whether a camera saw through.
@@ -166,17 +167,17 @@ class ObservedDistance:
 
 @dataclass(frozen=True)
 class GridNetwork:
-    """Features at the vertices of some grids, and the small network that reads them."""
+    """Sizes of the grids of features, and of the small network that reads them."""
 
     finest: float = limited(0.12, 0.04, 10.0)  # m; cell size of the finest grid
     levels: int = limited(3, 1, 16)  # number of grids, each twice as coarse as the one before
-    features: int = limited(4, 1, 16)  # numbers a vertex
+    features: int = limited(4, 1, 16)  # numbers at each vertex
     hidden: int = limited(32, 1, 4096)  # units of the one hidden layer
 
 
 @dataclass(frozen=True)
 class GridPlusMapping(NeusPlusMapping):
-    """Mapping of NeuS+ on grids. All chosen in the rooms for tuning (docs/tried.md)."""
+    """Settings of mapping with NeuS+ on grids, chosen in the rooms for tuning (docs/tried.md)."""
 
     iterations: int = 300
     n_rays: int = limited(96, 1, 65536)

@@ -13,8 +13,9 @@ from nbtrack.data.pixels import PLANE_JUMP, PLANE_REACH
 _EDGE_JUMP = 0.05  # a pixel is at an edge if a neighbour's depth differs by a larger share
 _DRAWN_PER_POINT = 4  # at most so many pixels are looked at for every point that is wanted
 # Pixels follow the low-discrepancy sequence R2 (Roberts 2018), whose first n members are spread
-# evenly for any n. The n-th pixel lies at the fractional parts of n g (down) and n g^2 (across);
-# g solves g^3 + g^2 = 1. The steps g and g^2 are integers here, in units of 1 / _MODULUS.
+# evenly for any n. With the solution g of g^3 + g^2 = 1, the n-th pixel lies at the fractional
+# parts of n g (down) and n g^2 (across) of the image. The steps g and g^2 are integers here, in
+# units of 1 / _MODULUS.
 _EVEN_STEPS = (0xC13FA9A9, 0x91E10DA5)
 _MODULUS = 2**32
 LUMA = (0.299, 0.587, 0.114)
@@ -50,9 +51,9 @@ def draw_points(
 ) -> Observed:
     """Draw `n_points` observed points and intensities from evenly spread pixels, without normals.
 
-    Pixels at the image's border and at depth edges are left out, since those at edges may belong to
-    either side. A pixel is at an edge if a neighbour's depth differs by a larger share than
-    `edge_jump`; none is if that is infinite.
+    Pixels at the image's border are left out, and so are pixels at depth edges, whose depth may be
+    that of either side. A pixel is at an edge if a neighbour's depth differs by a larger share than
+    `edge_jump`; with an infinite `edge_jump` no measured pixel is.
 
     The first pixel is random. At most `_DRAWN_PER_POINT` x `n_points` pixels are looked at, so that
     fewer points are returned if few pixels are measured.
@@ -113,8 +114,9 @@ def _drawn_points(
 def _normals(depth_mm: Array, pinhole: tuple, points: Array) -> Array:
     """Unit normals (n x 3, camera frame) of points (n x 3, m, camera frame); 0 where unknown.
 
-    They are those of `PixelSampler.normals_camera`: of the plane through four pixels at a distance
-    of `PLANE_REACH` of the image's width, if none of their depths differs too much.
+    A normal is that of the plane through four pixels around the point, at a distance of
+    `PLANE_REACH` times the image's width. It is unknown if the depth of one of them differs by more
+    than the share `PLANE_JUMP`. `PixelSampler.normals_camera` computes the same.
     """
     height, width = depth_mm.shape
     fx, fy, cx, cy = pinhole

@@ -19,7 +19,7 @@ from nbtrack.machinery.errors import ConfigError
 from nbtrack.machinery.settings import MANY, limited
 
 _MAX_CELLS_A_SIDE = 2**20  # with more, a cell's number would not fit into 64 bits
-_FRAMES_AT_ONCE = 8  # the sums of so many frames are merged at once, which bounds the memory
+_FRAMES_AT_ONCE = 8  # after so many frames their pixels are summed up, which bounds the memory
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PointMapping:
 
 
 class PointCloud(Field):
-    """A map of measured points with colours, one point a voxel. `fuse_points` makes it."""
+    """A map of measured points with colours, at most one in each voxel. `fuse_points` makes it."""
 
     name = "points"
     label = "Points"
@@ -109,7 +109,7 @@ def fuse_points(
         voxels, inside = cells_of(points_world, np.array(bounds.minimum), shape, voxel)
         values = np.column_stack([points_world, colors, np.ones(len(colors))])[inside]
         tables.append(pd.DataFrame(values, voxels))
-        # Merge: add up the rows of each voxel. The ones become its number of pixels.
+        # The rows of each voxel become their sum. The sum of the ones is the number of pixels.
         if count % _FRAMES_AT_ONCE == 0 or count == len(frames):
             tables = [pd.concat(tables).groupby(level=0).sum()]
     sums = tables[0].to_numpy()
@@ -124,8 +124,8 @@ def cells_of(
     """Numbers of the cells that contain points, and a mask (n) of the points inside the grid.
 
     The grid has its lowest corner at `low` (m), and `shape` cells of `voxel` (m) along x, y and z.
-    Its cells are numbered in row-major order: z is fastest. The numbers are those of the points
-    inside, in order; points outside have none.
+    Its cells are numbered in row-major order: z is fastest. There is one number for each point
+    inside the grid, in the order of the points, and none for points outside.
     """
     cells = np.floor((points - low) / voxel).astype(np.int64)
     inside = ((cells >= 0) & (cells < shape)).all(axis=1)
@@ -133,12 +133,12 @@ def cells_of(
 
 
 def min_depth_behind(points_world: Points, sequence: RgbdSequence, frames: Frames) -> Values:
-    """How far (z-depth, m) points (m) lie at least behind the surface that frames measured.
+    """How far (z-depth, m) points (m) lie behind the surfaces that frames measured: the minimum.
 
     In each frame a point is projected into the image, and the depth measured there is subtracted
-    from the point's depth. The minimum over the frames is returned. It is negative if a frame saw
-    through the point to something behind it, and infinite if no frame has the point in view or
-    measured a depth there. Every fifth frame is used, since neighbours see the same.
+    from the point's depth. The smallest difference over all frames is returned. It is negative if a
+    frame saw through the point to something behind it, and infinite if no frame has the point in
+    view or measured a depth there. Every fifth frame is used, since neighbours see the same.
     """
     behind = points_world.new_full(points_world.shape[:1], torch.inf)
     for index in frames[::5].tolist():

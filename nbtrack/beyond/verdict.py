@@ -27,18 +27,21 @@ _INTERCEPT = 2.01
 _COEFFICIENTS = np.array([-2.06, -0.28, 2.8, 1.39])
 MAD_FACTOR = 3.0  # a robust scale is so many median absolute residuals (MAD)
 SIGMAS = 0.6745 * MAD_FACTOR  # the same scale in standard deviations, if residuals are normal
-CORRELATED = 2.0  # factor of standard deviations that take correlated errors for independent ones
+# A standard deviation that is computed as if correlated errors were independent is too small. It is
+# multiplied by this factor.
+CORRELATED = 2.0
 # A pose is moved so far to see whether its cost grows. In a room with a partition the cost at right
 # poses grew in both directions at this distance, but within 5 cm in one alone (docs/tried.md).
 _MOVED_M = 2 * WRONG_M
 
 
 def features(report: Mapping[str, float]) -> Float[np.ndarray, "4"]:
-    """Logarithms with which the log odds of a wrong pose grow about linearly.
+    """The four features of a tracker's report from which the log odds of a wrong pose are computed.
 
-    They are computed from four numbers of a tracker's report: `fitting_ratio` and `known_ratio`
-    (see `LmOptimizer.certainty`), `intensity_ratio` (the median intensity difference divided by the
-    usual one), and `innovation` (the distance from where the frames before led to, in rad or m).
+    They are logarithms: of the odds of `fitting_ratio` and of `known_ratio` (shares that
+    `LmOptimizer.certainty` explains), of `intensity_ratio` (the median intensity difference divided
+    by the usual one), and of `innovation` (how far, in rad or m, the pose is from the nearest pose
+    that the frames before let expect).
     """
     # Ratios of 0 and 1 would have infinite log odds.
     fitting, known = np.clip([report["fitting_ratio"], report["known_ratio"]], 0.01, 0.99)
@@ -51,8 +54,8 @@ def features(report: Mapping[str, float]) -> Float[np.ndarray, "4"]:
 def p_lost(report: Mapping[str, float]) -> float:
     """The probability that the pose of a tracker's report is wrong.
 
-    Besides its `features` two numbers of the report count: `position_std_m`, and `last_step`, the
-    length (rad or m) of the last step, 0 if the pose has converged.
+    It depends on the `features` and on two other numbers of the report: `position_std_m`, and
+    `last_step`, the length (rad or m) of the last step, which is 0 if the pose has converged.
     """
     p_right = 1 / (1 + math.exp(_INTERCEPT + _COEFFICIENTS @ features(report)))
     spread = math.hypot(CORRELATED * report["position_std_m"], report["last_step"])
@@ -74,14 +77,14 @@ def std_when_moved(
     """The position's standard deviation (m), from how much the cost grows `_MOVED_M` away.
 
     `costs_at` gives the cost of each of the frame's n points at a pose. Costs must be those of
-    Geman and McClure, at scales of `MAD_FACTOR` medians. The pose is moved both ways along the
-    `n_directions` least certain directions of the position, by the likeliest twist under
+    Geman and McClure, at scales of `MAD_FACTOR` medians. The pose is moved both ways along each of
+    the `n_directions` least certain directions of the position, by the likeliest twist under
     `covariance` (rad and m, world axes, as `lm_solver.retract` takes twists). The smallest growth
-    of the mean cost counts.
+    of the mean cost counts. A map's errors at neighbouring points are correlated, so that at most
+    `n_independent` points count as independent.
 
     The curvature of the cost alone is not enough: ripples in the map of a flat wall have gradients,
-    too, but the frame fits as well all along the wall. A map's errors at neighbouring points are
-    correlated, so that at most `n_independent` points count.
+    too, but the frame fits as well all along the wall.
     """
     variances, directions = np.linalg.eigh(covariance[3:, 3:])  # ascending: the last is the largest
     here = costs_at(T_world_camera)

@@ -22,8 +22,9 @@ _COLUMNS = 20
 _ROWS = 15
 _STEP = 0.05  # of x / z and y / z from one direction to the next: a view spans 53 by 41 degrees
 _DEPTH_UNIT = 0.05  # m; a view's depths are bytes in this unit, and 0 if unknown
-_MAX_LOG_RATIO = 0.3  # depths with a larger |log ratio| are of different surfaces, and count as it
-_DEPTH_WEIGHT = 2.0  # of the dissimilarity of depths; that of luma has the weight 1
+# Two depths with a larger |log ratio| are of different surfaces. Their ratio counts as this one.
+_MAX_LOG_RATIO = 0.3
+_DEPTH_WEIGHT = 2.0  # weight of the dissimilarity of depths; the dissimilarity of luma has 1
 View = UInt8[Tensor, "2 15 20"]  # luma and depth
 
 
@@ -37,9 +38,9 @@ class Viewpoints(NamedTuple):
 def view_of(frame: Frame) -> View:
     """The view of a frame: luma and depth along fixed directions, in one byte each.
 
-    Luma is here the mean of red, green and blue, from 1 to 255, and 0 out of the picture. Depth is
-    in `_DEPTH_UNIT`, and 0 if less than half of a cell was measured. The frame is averaged in cells
-    of the size `_STEP`, and then interpolated along the view's directions.
+    The frame is averaged in cells of the size `_STEP`, and then interpolated along the view's
+    directions. Luma is here the mean of red, green and blue, from 1 to 255, and 0 along directions
+    outside of the picture. Depth is in `_DEPTH_UNIT`, and 0 if half of a cell or less was measured.
     """
     camera = frame.camera
     luma, depth_mm = frame.color.float().mean(dim=-1), frame.depth_mm.float()
@@ -78,16 +79,16 @@ def spread_out(T_world_camera: Poses) -> Int[np.ndarray, "_"]:
 
 
 def retrieve(view: View, viewpoints: Viewpoints, n: int) -> Poses:
-    """Hypotheses of the pose from which a view was seen, the most similar viewpoint first.
+    """Poses from which a view may have been seen: those of the `n` most similar viewpoints.
 
-    They are the poses of the `n` viewpoints whose views are most similar. The camera may be turned
-    against such a viewpoint. So its view is shifted by some rows and columns, and its pose is
-    turned about the camera's x and y axes by the angles of the best shift.
+    The most similar one comes first. The camera may be turned relative to a viewpoint. So the
+    viewpoint's view is compared at several shifts by rows and columns, and its pose is turned about
+    the camera's x and y axes by the angles of the best shift.
     """
     shifts = [(down, across) for across in range(-6, 7, 3) for down in range(-3, 4, 3)]  # in cells
     here, there = view.float(), viewpoints.views.float()
     costs = [_dissimilarity(_cropped(here, y, x), _cropped(there, -y, -x)) for y, x in shifts]
-    minimum, best_shift = torch.stack(costs).min(dim=0)  # of each viewpoint
+    minimum, best_shift = torch.stack(costs).min(dim=0)  # for each viewpoint
     order = minimum.argsort()[:n].numpy()
     # A camera that is turned up sees the same things lower: a positive turn about x. A camera that
     # is turned left sees them farther right: a negative turn about y.
@@ -108,11 +109,11 @@ def _cropped(view: Tensor, down: int, across: int) -> Tensor:
 
 
 def _dissimilarity(here: Float[Tensor, "2 _ _"], there: Float[Tensor, "n 2 _ _"]) -> Values:
-    """The dissimilarity of a view and n others: that of luma plus `_DEPTH_WEIGHT` x that of depth.
+    """The dissimilarities of a view from n others: luma's plus `_DEPTH_WEIGHT` times depth's.
 
-    The dissimilarity of luma is 1 minus the correlation over the cells that both views see. That of
-    depth is |log ratio| / `_MAX_LOG_RATIO`, at most 1, in the mean over the cells that both views
-    measured; it is 1 if these are too few.
+    The dissimilarity of luma is 1 minus the correlation over the cells that both views see. The
+    dissimilarity of depth is the mean of |log ratio| / `_MAX_LOG_RATIO`, of which each counts as at
+    most 1, over the cells that both views measured. It is 1 if these are at most 30 of 300.
     """
     is_seen = ((here[0] > 0) & (there[:, 0] > 0)).float()
     first, second = _centred(here[0], is_seen), _centred(there[:, 0], is_seen)
