@@ -115,7 +115,7 @@ def test_maps_and_their_scores(preset, scenes: list[Scene]) -> None:
 
 
 def test_budgets(preset, scenes: list[Scene], monkeypatch) -> None:
-    """Catches a budget other than asked for: the paper's steps, so many steps, or the clock alone."""
+    """Catches another budget than asked for: the paper's steps, so many steps, or the clock."""
     by_steps = track_scenes(scenes[1:], ["vr_neus", "sdf"], preset, [10])
     assert by_steps["steps"].tolist() == [6.8, 15.3]
     assert by_steps["rate_hz"].tolist() == [10, 10]
