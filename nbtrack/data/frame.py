@@ -10,9 +10,7 @@ from torch import Tensor
 from nbtrack.core.arrays import Colors, Indices, Points, Pose, Values
 from nbtrack.core.camera import Intrinsics, backproject
 from nbtrack.machinery.errors import typed
-from nbtrack.machinery.inputs import check_array, checked_images
-
-MILLIMETRE = 1e-3
+from nbtrack.machinery.inputs import MILLIMETRE, check_array, checked_images
 
 
 @typed

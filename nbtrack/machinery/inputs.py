@@ -22,7 +22,7 @@ _FARTHEST = 1e7  # m from the origin: beyond geographic coordinates; floats can 
 # A pose is wrong if its distance from the median position is more than so many times the distance
 # within which nine in ten poses lie, or more than so many metres, whichever is larger.
 _ALONE = 1000.0
-_MILLIMETRE = 1e-3
+MILLIMETRE = 1e-3  # m; depth images are kept in this unit
 _MAX_MILLIMETRES = np.iinfo(np.uint16).max
 _MAX_METRES = 100.0  # a median depth beyond it is in another unit (our choice)
 _DEPTH_UNITS = "uint16 in mm, or floating point in metres"
@@ -90,7 +90,7 @@ def checked_images(color: Any, depth: Any, size: tuple[int, int]) -> tuple[np.nd
         median = np.median(metres[metres > 0]) if metres.any() else 0
         if median > _MAX_METRES:
             raise DataError(f"depth is {median:.4g} m in the median: give {_DEPTH_UNITS}")
-        filled = (metres / _MILLIMETRE).round().clip(0, _MAX_MILLIMETRES)
+        filled = (metres / MILLIMETRE).round().clip(0, _MAX_MILLIMETRES)
     depth_mm = filled.astype(np.int32)
     # This largest value means "farther than 16 bits can say", so it is no measurement.
     depth_mm[depth_mm >= _MAX_MILLIMETRES] = 0

@@ -45,7 +45,7 @@ def movie_pictures(
     """
     left, middle, right = new_axes(title, 2.8, 1, 3, width_ratios=[1, 1, 0.9])[0]
     page = draw_cloud(right, cloud_of(surface), {"tracked": T_estimated})
-    path, dot = right.lines  # the dot was drawn at the start; here it moves along the path
+    path, dot = right.lines  # all that `draw_cloud` draws; the dot, at the start, moves along below
     dot.set_color(path.get_color())
     label = right.text(0, 1.03, "", transform=right.transAxes)
     canvas = FigureCanvasAgg(left.figure)
@@ -92,6 +92,7 @@ def view_of(surface: Mesh, camera: Intrinsics, T_world_camera: Pose) -> np.ndarr
     height = round(scale * camera.height)
     points_camera = (np.asarray(surface.vertices) - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     is_cloud = isinstance(surface, trimesh.PointCloud)
+    # Each part is a polygon: a face with the indices of its corners, or a point with its own.
     parts = np.arange(len(points_camera))[:, None] if is_cloud else surface.faces
     corners = points_camera[parts] + (_SQUARE if is_cloud else 0)
     depth = np.maximum(corners[..., 2:], _NEAR)  # avoids a division by 0 in parts left out below

@@ -176,9 +176,9 @@ def draw_slice(
     _, values = query_field(field, points)
     level = field.surface_level
     if field.is_distance:
-        limit = 0.25 * max(1, np.ceil(np.quantile(np.abs(values), 0.98) / 0.25))  # m, on a line
+        limit = 0.25 * max(1, np.ceil(np.quantile(np.abs(values), 0.98) / 0.25))  # m; on a line
         own_norm, colors = Normalize(-limit, limit), "RdBu"
-    else:
+    else:  # four decades around the value at the surface
         own_norm, colors = LogNorm(level / 200, 50 * level, clip=True), "YlOrBr"
     look = {"shading": "nearest", "rasterized": True}  # pixels are centred on the points
     xy = np.moveaxis(places, -1, 0)  # matplotlib takes two arrays of coordinates

@@ -151,10 +151,10 @@ def _calibration(folder: Path, layout: Format) -> tuple[Calibration, str]:
 
 
 def _pose_pattern(folder: Path, layout: Format) -> str | None:
-    """The format's pattern of pose files that matches files in the folder.
+    """The one of the format's patterns of pose files that matches files in the folder.
 
-    It holds a `*` if every frame has a file of its own. None if the folder has no poses. Raises
-    DataError if files of several patterns are there.
+    The pattern holds a `*` if every frame has a file of its own. It is None if the folder has no
+    poses. Raises DataError if files of several patterns are there.
     """
     there = [pattern for pattern in layout.poses if files_of(folder, pattern)]
     if len(there) > 1:

@@ -145,9 +145,11 @@ def _resolved(value: Any, named: dict[str, Material]) -> Any:
     A text is the name of a material and is looked up in `named`. A table with a `kind` is a new
     material: its other entries become arguments of that function of `materials`.
     """
+    if isinstance(value, str):
+        return named[value]
     if isinstance(value, list):
         return tuple(_resolved(item, named) for item in value)
     if not isinstance(value, dict):
-        return named[value] if isinstance(value, str) else value
+        return value
     options = {key: _resolved(item, named) for key, item in value.items() if key != "kind"}
     return partial(getattr(materials, value["kind"]), **options) if "kind" in value else options
