@@ -33,12 +33,12 @@ READINGS = {"metre": PREVIOUS, "map": PREVIOUS, "metre, constant velocity": VELO
 
 
 def least_of_all(T_world_camera: np.ndarray, reach_m: float) -> float:
-    """The smallest ATE (m) of all paths that move at most by the reach a frame along each axis.
+    """The smallest ATE (m) of all paths that move by at most the reach in a frame, along each axis.
 
-    Constrained least squares for the motion of each frame: `sums` adds motions up to positions.
+    The motions of all frames are found by constrained least squares.
     """
     offsets = T_world_camera[1:, :3, 3] - T_world_camera[0, :3, 3]
-    sums = np.tril(np.ones((len(offsets), len(offsets))))
+    sums = np.tril(np.ones((len(offsets), len(offsets))))  # times the motions: the positions
     # `cost` is half the sum of squared residuals.
     costs = [lsq_linear(sums, axis, (-reach_m, reach_m)).cost for axis in offsets.T]
     return float(np.sqrt(2 * sum(costs) / len(offsets)))
@@ -55,12 +55,12 @@ def bounds_of(scene: str) -> pd.DataFrame:
         steps = paper_steps(tracker, rate_hz)
         unit = DATASET_UNITS.get(scene, np.nan) if reading == "map" else 1.0
         reach_m, motion_model = reach(steps, unit * RATE), READINGS[reading]
-        is_any = motion_model == PREVIOUS and np.isfinite(reach_m)
+        has_least = motion_model == PREVIOUS and np.isfinite(reach_m)
         row = {"tracker": tracker, "rate_hz": rate_hz, "steps": steps, "reading": reading}
         row |= {"published_ate_m": published[rate_hz, method, DATASET_SCENES[scene]]}
         row |= {"metres_per_unit": unit, "reach_m": reach_m}
         row |= {"greedy_ate_m": greedy_ate(path, reach_m, motion_model)}
-        row |= {"least_any_m": least_of_all(path, reach_m) if is_any else np.nan}
+        row |= {"least_any_m": least_of_all(path, reach_m) if has_least else np.nan}
         rows.append({**known, **row})
     return pd.DataFrame(rows)
 

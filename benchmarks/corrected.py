@@ -87,7 +87,10 @@ def main() -> None:
 
 
 def _track(scenes, methods, preset, frames, path, tracked=None, steps=30, seeds=SEEDS):
-    """Rows of runs with at most `steps` a frame; None: the paper's steps at 2 Hz."""
+    """Rows of runs with at most `steps` steps a frame; with None, the paper's steps at 2 Hz.
+
+    `scenes` are mapped. `tracked` are tracked in their maps; with None, these are `scenes`, too.
+    """
     how = {"steps": steps, "frames": frames, "seeds": seeds, "execution": ALONE}
     rates_hz = [2] if steps is None else None
     found = track_scenes(scenes, methods, preset, rates_hz, tracked=tracked, **how)
@@ -118,7 +121,7 @@ def _judged(run: str, wrong_m: float) -> dict[str, float]:
 
 
 def frame_times(rooms, preset) -> pd.DataFrame:
-    """Milliseconds a frame and errors of LM and ICP, in turns on the same frames; medians."""
+    """Medians of a frame's milliseconds and error, for LM and ICP, in turns on the same frames."""
     rows = []
     for room, n_pixels in product(rooms, (512, 2048, 4096)):
         sequence, trackers = room.read(":120"), {}

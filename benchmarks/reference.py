@@ -135,7 +135,7 @@ def registered_pairs(sequence) -> np.ndarray:
 
 
 def pair_errors(path, pairs: np.ndarray) -> np.ndarray:
-    """Errors (m) of a path's positions, in the camera frame `GAP` before, against `pairs`."""
+    """How far (m) each frame's position, seen from the frame `GAP` before, is off its pair."""
     poses = path.T_world_camera
     off = (np.linalg.inv(poses[:-GAP]) @ poses[GAP:] - pairs)[:, :3, 3]
     return np.linalg.norm(off, axis=1)

@@ -108,7 +108,8 @@ def tracked(field: Field, sequence: RgbdSequence, n_pixels: int) -> pd.DataFrame
 def searched(field, sequence, cm, degrees, n_pixels, steps) -> pd.DataFrame:
     """Reports and errors of frames that are searched for from starts that are off.
 
-    If the starts are far off, the tracker takes the frame before for lost.
+    The starts are off by `cm` and `degrees`. If they are far off, the tracker is told that the
+    frame before was lost.
     """
     rows = []
     tracker = make_tracker("lm", field, np.eye(4), StepBudget(steps), settings(n_pixels))

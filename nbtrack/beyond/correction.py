@@ -104,16 +104,14 @@ class CorrectedField(BakedField):
 def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     """Correct a map in cells of `voxel` (m) by its mapped frames, as `corrected` does.
 
-    `sequence` must be the one that was mapped. The record of the new map has the time that the
-    correction took, the memory (bytes) of network and correction, and the misfit of the corrected
-    map. Raises what `corrected` raises.
+    `sequence` must be the one that was mapped. The record of the new map has the seconds that the
+    correction took, and the misfit of the corrected map. Raises what `corrected` raises.
     """
     start = time.perf_counter()
     mapped, _ = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])
     field = corrected(finished.field, sequence, mapped, voxel)
     seconds = time.perf_counter() - start
     record = {**finished.record, "correction": voxel, "correction_seconds": seconds}
-    record["map_bytes"] = sum(tensor.nbytes for tensor in field.state_dict().values())
     record["seconds"] += seconds
     record["misfit_m"] = usual_misfit(field, sequence, mapped)
     return replace(finished, field=field, record=record)

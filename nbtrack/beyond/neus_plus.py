@@ -104,14 +104,15 @@ def distance_targets(
     Source: iSDF (Ortiz et al. 2022) has distances along the ray, and nearest points as its "pc"
     bounds, but of one batch and not of all frames. The choice between the two is ours.
     """
-    before = rays.depth[:, None] - depths  # z-depth from a sample to the surface; negative behind
+    # m of z-depth from a sample to the ray's surface; negative behind the surface.
+    to_surface = rays.depth[:, None] - depths
     # Distance from the plane for each metre of z-depth; 0 if the normal is unknown.
     per_depth = (rays.normals_world * rays.directions_world).sum(dim=1).abs()[:, None]
-    plane = before * per_depth
-    is_plane_nearest = (per_depth > 0) & ((plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
-    target = torch.where(is_plane_nearest, plane, nearest)
-    in_front = (before > 0) & (is_plane_nearest | (before > settings.surface_band))
-    just_behind = (before <= 0) & (plane > -0.1)  # m
+    to_plane = to_surface * per_depth
+    is_plane_nearest = (per_depth > 0) & ((to_plane.abs() - nearest).abs() < _PLANE_TOLERANCE)
+    target = torch.where(is_plane_nearest, to_plane, nearest)
+    in_front = (to_surface > 0) & (is_plane_nearest | (to_surface > settings.surface_band))
+    just_behind = (to_surface <= 0) & (to_plane > -0.1)  # m
     known = in_front | (just_behind & is_plane_nearest & ~is_free)
     return target, (known & (rays.depth[:, None] > 0)).float()
 
@@ -198,10 +199,9 @@ class FeatureGrid(nn.Module):
     def __init__(self, settings: GridNetwork, bounds: SceneBounds, generator: Generator) -> None:
         super().__init__()
         self.metres_per_unit = bounds.metres_per_unit
-        self.register_buffer(
-            "low", torch.tensor(bounds.minimum, dtype=torch.float32), persistent=False
-        )
-        extent = self.low.new_tensor(bounds.maximum) - self.low
+        low, high = torch.tensor([bounds.minimum, bounds.maximum], dtype=torch.float32)
+        self.register_buffer("low", low, persistent=False)
+        extent = high - low
         self.voxels = [settings.finest * 2**level for level in range(settings.levels)]
         shapes = [((extent / voxel).ceil().long() + 1).tolist() for voxel in self.voxels]
         options = {"generator": generator, "dtype": torch.float32}

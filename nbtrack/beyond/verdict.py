@@ -63,7 +63,10 @@ def p_lost(report: Mapping[str, float]) -> float:
 
 
 def p_within(position_std_m: float) -> float:
-    """The probability that a normal error along one direction, of this std, is below `WRONG_M`."""
+    """The probability that an error along one direction is below `WRONG_M`.
+
+    The error is normal, with the standard deviation `position_std_m` (m).
+    """
     return math.erf(WRONG_M / math.sqrt(2) / position_std_m)
 
 
@@ -111,6 +114,7 @@ def score_detection(
     {'lost_precision': 0.5, 'lost_recall': 0.5}
     """
     is_lost = errors_m > LOST_THRESHOLD_M
-    both = int((called_lost & is_lost).sum())
-    counts = {"lost_precision": int(called_lost.sum()), "lost_recall": int(is_lost.sum())}
-    return {name: both / count if count > 0 else None for name, count in counts.items()}
+    n_found = int((called_lost & is_lost).sum())
+    # Precision is n_found divided by the frames called lost, recall by the frames that are lost.
+    divisors = {"lost_precision": int(called_lost.sum()), "lost_recall": int(is_lost.sum())}
+    return {name: n_found / n if n > 0 else None for name, n in divisors.items()}

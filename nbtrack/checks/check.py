@@ -67,8 +67,9 @@ class DataReport:
     def __str__(self) -> str:
         recording, cloud = self.recording, self.cloud
         declared, *others = self.conventions
-        rivals = sorted((c for c in others if c.overlap > 0), key=lambda c: -c.agreement)[:3]
-        compared = [declared, *rivals]
+        # The declared convention, and the three best of the others.
+        rivals = sorted((c for c in others if c.overlap > 0), key=lambda c: -c.agreement)
+        compared = [declared, *rivals[:3]]
         camera = declared.reading.camera
         wide_deg = 2 * np.degrees(np.arctan(camera.width / 2 / camera.fx))
         near, far = cloud.depth.quantile([0.01, 0.99])

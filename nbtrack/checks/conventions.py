@@ -101,9 +101,9 @@ def fit_all(pairs: FramePairs, as_declared: Reading) -> tuple[list[Convention], 
 
 
 def axes_name(camera_axes: str, poses: str) -> str:
-    """For people: `OpenGL axes (x right, y up, z backward), camera-to-world`.
+    """A convention of poses in words: `OpenGL axes (x right, y up, z backward), camera-to-world`.
 
-    `camera_axes` is a name or three words, as in a `Declaration`.
+    `camera_axes` is a name or three words, and `poses` a direction, as in a `Declaration`.
     """
     x, y, z = SPELLED_AXES.get(camera_axes, camera_axes).split()
     return f"{_NAMES.get(camera_axes, 'axes')} (x {x}, y {y}, z {z}), {poses}"

@@ -222,9 +222,9 @@ class FramePairs:
         return torch.from_numpy(np.linalg.solve(T_second, T_first)).float()
 
     def _area_gaps(self, gaps: Float[Tensor, "pairs points"]) -> Gaps:
-        """The median gap of each area's points; NaN if few of them are valid.
+        """The median gap of each area's points; NaN if few of the points are valid.
 
-        The median reduces the sensor's noise. An error of the reading stays in it.
+        The median has less of the sensor's noise than a single gap, and all of the reading's error.
         """
         by_area = gaps[:, self.points_of_areas]  # (pairs, areas, points in an area)
         is_known = by_area.isfinite().float().mean(dim=-1) >= _MIN_VALID

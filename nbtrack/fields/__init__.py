@@ -17,7 +17,7 @@ FIELDS: Registry[type[Field]] = Registry({"imap": IMapField, "neus": NeuSField})
 
 
 def field_class(name: str) -> type[Field]:
-    """The field class of a name. Raises ConfigError, which names a similar one, if unknown."""
+    """The class of fields with a name. Raises ConfigError, with a similar name, for no class."""
     return look_up_kind("field", name, FIELDS, ("name", "label"))
 
 

@@ -132,11 +132,14 @@ class LearnedField(Field):
         """Weighted loss terms, by name, of rays that `draw` returns. Their sum is minimised."""
 
     def prepare(self, sequence: RgbdSequence, frames: Frames) -> None:
-        """Compute what the losses need besides batches, before mapping, from the mapped frames."""
+        """Prepare for mapping: compute from the mapped frames what the losses need besides batches.
+
+        Fields whose losses need nothing else do nothing here.
+        """
 
     @classmethod
     def from_state(cls, state: State, made: dict[str, Any], bounds: SceneBounds) -> "LearnedField":
-        """The field with these weights; they are constants from now on."""
+        """The field of a map file. Its weights are constants: they need no gradient."""
         field = cls(cls.Network(**made["network"]), bounds, Generator())
         field.load_state_dict(state)
         return field.eval().requires_grad_(False)

@@ -98,10 +98,10 @@ class NeuSField(LearnedField):
         inputs. Here the last layer, which is linear, is fitted by least squares at random points in
         the box to the distance from its nearest face (our choice).
         """
-        single = {"dtype": torch.float32}
-        low, high = (torch.tensor(c, **single) for c in (self.bounds.minimum, self.bounds.maximum))
-        # m, world frame, uniform in the box
-        points = low + (high - low) * torch.rand(8192, 3, generator=generator, **single)
+        corners = [self.bounds.minimum, self.bounds.maximum]
+        low, high = torch.tensor(corners, dtype=torch.float32)
+        drawn = torch.rand(8192, 3, generator=generator, dtype=torch.float32)
+        points = low + (high - low) * drawn  # m, world frame, uniform in the box
         target = torch.minimum(points - low, high - points).amin(dim=1)  # m, to the nearest face
         features = self.mlp.features(points)
         design = torch.cat([features, torch.ones_like(features[:, :1])], dim=1).double()

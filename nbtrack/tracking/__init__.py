@@ -14,7 +14,7 @@ TRACKERS: Registry[type[Tracker]] = Registry({"vr": VrTracker, "sdf": SdfTracker
 
 
 def tracker_class(name: str) -> type[Tracker]:
-    """The tracker class of a name. Raises ConfigError, which names a similar one, if unknown."""
+    """The class of trackers with a name. Raises ConfigError, with a similar name, for no class."""
     return look_up_kind("tracker", name, TRACKERS, ["name"])
 
 

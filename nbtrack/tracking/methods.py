@@ -21,7 +21,10 @@ class Method:
     settings: tuple[str, ...] = ()
 
     def paper_steps(self, rate_hz: float | int) -> float:
-        """Steps per frame on the paper's hardware: VR's for a tracker that renders, else SDF's."""
+        """The steps per frame that this method gets at a rate (Hz).
+
+        They are VR's on the paper's hardware for a tracker that renders, and SDF's for any other.
+        """
         return paper_steps("vr" if tracker_class(self.tracker).renders else "sdf", rate_hz)
 
     @property
