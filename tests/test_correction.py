@@ -10,7 +10,7 @@ import torch
 from box_room import BoxRoom, Formula, box_sequence, poses_at
 
 from nbtrack import Frame, Map, read_map, write_map
-from nbtrack.beyond.correction import CorrectedField, correct_map, corrected
+from nbtrack.beyond.correction import CORRECTIONS, CorrectedField, correct_map, corrected
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import corrected_vertices, regularisation_of, solve
 from nbtrack.beyond.lm import LmSettings, LmTracker
@@ -212,3 +212,6 @@ def test_minimum_scales_follow_the_sensor(found: CorrectedField, sequence: RgbdS
     field = corrected(found.source, noisy, np.arange(12), VOXEL)
     # Walls are mostly seen at an angle, where less of the noise is along the normal.
     assert 0.5 * 3.7 * 0.006 < field.accuracy.residual_sigma[0] < 3.7 * 0.006
+    medians = {"residual_medians": torch.tensor([0.01, 0.1])}
+    field.add({name: getattr(field, name) for name in CORRECTIONS} | medians)
+    assert field.accuracy.residual_sigma == pytest.approx((0.055, 0.23))

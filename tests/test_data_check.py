@@ -6,6 +6,7 @@ Of bare walls with exact depth; of rooms seen with a Kinect's noise, and of a re
 import re
 import shutil
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 from unittest import mock
@@ -27,7 +28,7 @@ from nbtrack.data.sequence import observed_bounds
 from nbtrack.experiments.scenes import Scene
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.settings import with_settings
-from nbtrack.recordings.formats import WORLD_TO_CAMERA
+from nbtrack.recordings.formats import WORLD_TO_CAMERA, Declaration
 from nbtrack.recordings.recording import open_recording
 from nbtrack.synthetic.make import make_room
 
@@ -69,6 +70,15 @@ def as_written(T: np.ndarray, camera_axes: str, poses: str = "camera-to-world") 
 
 def rewrite_poses(folder: Path, poses: np.ndarray) -> None:
     (folder / "poses.txt").write_text(recordings.matrix_text(poses.reshape(-1, 4)))
+
+
+def test_axes_of_either_hand_come_back() -> None:
+    """Catches poses that stay mirrored, or are none, where camera and world are left-handed."""
+    poses = walk(3)
+    for axes, way in product(AXES, ("camera-to-world", INVERSE)):
+        written = np.stack([as_written(T, axes, way) for T in poses])
+        found = Declaration(camera_axes=axes, poses=way).poses_to_opencv(written)
+        np.testing.assert_allclose(found, poses, atol=1e-12)
 
 
 @pytest.fixture

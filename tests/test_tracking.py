@@ -135,6 +135,9 @@ def test_an_unknown_start_is_searched_beyond_the_budget(monkeypatch) -> None:
     tracker.report = lambda: {"lost": len(tracker.estimates) < 3}  # in the first two frames
     found = track_sequence(tracker, walk(5), is_start_known=False)
     assert found.frames["steps"].tolist() == [9, 9, 9, 2, 2]
+    tracker.report = lambda: {}  # that does not judge itself
+    found = track_sequence(tracker, walk(3), is_start_known=False)
+    assert found.frames["steps"].tolist() == [9, 2, 2]
 
 
 def test_warm_up_steps_count_nowhere() -> None:
