@@ -132,7 +132,7 @@ SPELLINGS += ["1.#R", "-1.#J", "1.#INF", "sNaN", "-NaN123", "inf", "-Infinity"]
 
 
 LOST = [7 * [spelling] for spelling in SPELLINGS]
-LOST += [row.split() for row in ("0 0 0 0 0 0 0", "1.5 1 2 0 0 0 0", "nan 1 2 0 0 0 1")]
+LOST += [row.split() for row in ("0 0 0 0 0 0 0", "1.5 1 2 0 0 0 0", "1 2 3 nan 0 0 1")]
 
 
 @pytest.mark.parametrize("words", LOST, ids=" ".join)
