@@ -30,7 +30,7 @@ from nbtrack.tracking import (
     track_sequence,
     tracker_class,
 )
-from nbtrack.tracking.starts import expected_poses
+from nbtrack.tracking.starts import expected_poses, rigid
 
 SETTINGS = {"vr": VrSettings(n_pixels=128), "sdf": SdfSettings(n_pixels=256, lambda_color=0.1)}
 
@@ -250,6 +250,8 @@ def test_motion_models() -> None:
     still, moving, both = (expected_poses(model, poses[:3]) for model in models)
     np.testing.assert_allclose([*still, *moving], poses[2:], atol=1e-12)
     np.testing.assert_array_equal(both, [*moving, *still])
+    stretched = np.diag([2.0, 1.0, 1.0, 1.0])
+    assert rigid(stretched)[0, 0] < stretched[0, 0] == 2  # of the estimates none is changed
     with pytest.raises(ConfigError, match="did you mean 'constant_velocity'"):
         expected_poses("constant_velocty", poses)
 

@@ -105,7 +105,7 @@ def trilinear(
     """
     extent = voxel * (constant(tuple(volume.shape[1:]), low.device, low.dtype) - 1)
     # `grid_sample` takes positions from -1 to 1, in the reverse order of the volume's axes.
-    normalized = (2 * (points - low) / extent - 1).flip(-1)[None, None, None]
+    normalized = (2 * (points - low) / extent - 1).flip(1)[None, None, None]
     values = grid_sample(volume[None], normalized, padding_mode="border", align_corners=True)
     return values[0, :, 0, 0]
 

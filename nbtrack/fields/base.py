@@ -189,7 +189,7 @@ class LearnedField(Field):
                 weights = nn.functional.pad(weights, (0, 1)) + nn.functional.pad(weights, (1, 0))
             fine = rendering.importance_depths(coarse, weights, n_importance, generator)
         fine_colors, fine_values = self.query_along(rays, fine)
-        depths, order = torch.cat([coarse, fine], dim=1).sort(dim=1)
+        depths, order = torch.cat([coarse, fine], dim=1).sort()
         all_colors = torch.cat([colors, fine_colors], dim=1).take_along_dim(order[..., None], dim=1)
         all_values = torch.cat([values, fine_values], dim=1).gather(1, order)
         return self.composite(all_colors, all_values, rays, depths)

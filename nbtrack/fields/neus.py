@@ -133,4 +133,4 @@ def guided_depths(
     offsets = stratified_samples(-1.0, torch.ones_like(far), settings.n_surface, generator)
     center = torch.where(is_measured, rays.depth, far_bound)
     around = (center[:, None] + settings.surface_band * offsets).clamp_min(base.NEAR)
-    return torch.cat([coarse, around], dim=1).sort(dim=1).values
+    return torch.cat([coarse, around], dim=1).sort().values

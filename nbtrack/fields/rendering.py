@@ -37,7 +37,7 @@ def weights_from_density(
     last sample has no next one and takes the delta of the sample before it (our choice: so a wall
     stays opaque, and free space free). Source: Sucar et al. 2021 (iMAP), Sec. 3.2.
     """
-    z_steps = depths.diff(dim=1)
+    z_steps = depths.diff()
     sections = torch.cat([z_steps, z_steps[:, -1:]], dim=1) * ray_lengths[:, None]
     optical_depth = density * sections
     opacity = -torch.expm1(-optical_depth)
@@ -63,7 +63,7 @@ def weights_from_sdf(sdf: RaySamples, inverse_std: Scalar) -> Float[Tensor, "ray
     # log_ratio is the logarithm of 1 - alpha_i = Phi(f_{i+1}) / Phi(f_i), which is at most 1. The
     # quotient itself would be 0/0 deep inside objects.
     log_phi = torch.nn.functional.logsigmoid(inverse_std * sdf)
-    log_ratio = log_phi.diff(dim=1).clamp_max(0)
+    log_ratio = log_phi.diff().clamp_max(0)
     # The logarithm of Phi(f_0) times all (1 - alpha_j) before a section. The sum includes the
     # section's own term, which is subtracted again.
     log_passed = log_phi[:, :1] + log_ratio.cumsum(dim=1) - log_ratio
