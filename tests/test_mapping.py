@@ -57,16 +57,6 @@ def test_neus_finds_a_wall() -> None:
     assert mapped.record["first_and_last_frame"] == [0, 5]
 
 
-def test_imap_renders_a_wall() -> None:
-    """Catches densities that do not absorb: the rendered depth must be the wall's."""
-    settings = settings_of("imap", iterations=120, n_stratified=20, n_surface=8)
-    sequence = wall_sequence()
-    mapped = map_sequence("imap", sequence, NETWORK, settings)
-    color, depth = mapped.field.render_view(sequence.intrinsics, sequence.T_world_camera[2])
-    assert np.median(np.abs(depth - 2.0)) < 0.06
-    assert np.median(np.abs(color - 128 / 255)) < 0.06
-
-
 def test_points_are_fused_at_once() -> None:
     """Catches held-out frames among the points, and a bar that never ends."""
     seen, settings = [], PointMapping(voxel=0.05, holdout_every=3)
