@@ -204,11 +204,13 @@ def test_a_step_of_a_fit_by_hand() -> None:
     assert mean_apart(np.array([[0.01, np.nan, -0.3]])) == pytest.approx((0.01 + 0.05) / 2)
 
 
-def ends_of(depths_mm: np.ndarray, poses: np.ndarray) -> FramePairs:
+def ends_of(
+    depths_mm: np.ndarray, poses: np.ndarray, camera: Intrinsics = READING.camera
+) -> FramePairs:
     """The pair of the first frame and the last."""
     declared = Declaration(camera_axes="opencv")
     recording = mock.Mock(spec=Recording, file_poses=poses, declared=declared)
-    sequence, n_frames = sequence_of(depths_mm, READING.camera, poses=poses), len(poses)
+    sequence, n_frames = sequence_of(depths_mm, camera, poses=poses), len(poses)
     return FramePairs(recording, np.arange(n_frames), sequence, np.array([[0], [n_frames - 1]]))
 
 
@@ -220,10 +222,13 @@ def wall_from(place_m: float, n_frames: int = 2) -> FramePairs:
 
 
 def test_a_leaning_wall_that_is_seen_twice() -> None:
-    """Catches depth that is taken from beside where a point is seen, and a mean depth."""
+    """Catches depth that is taken from beside where a point is seen, and a mean depth; and more
+    than 24 areas of an image whose rows and columns they do not divide."""
+    small, still = Intrinsics(35, 11, 30.0, 30.0, 17.5, 5.5), poses_at(np.zeros((2, 3)))
+    assert len(ends_of(np.full((2, 11, 35), 2000.0), still, small).points_of_areas) == 24
     rows, columns = np.indices((48, 64)) + 0.5
     depth_mm = 2000 / (1 - 0.6 * (columns - 32) / 48 - 0.3 * (rows - 24) / 48)
-    found = ends_of(np.stack([depth_mm] * 2), poses_at(np.zeros((2, 3)))).compare(READING)
+    found = ends_of(np.stack([depth_mm] * 2), still).compare(READING)
     assert np.nanmax(np.abs(found.area_gaps)) < 5e-4
     assert found.overlap == pytest.approx(1, abs=0.1)
     assert found.depth_m == pytest.approx(np.median(depth_mm) / 1000, rel=0.01)
