@@ -55,7 +55,7 @@ def latex_file(styler: Any, path: Path, note: str, wording: Wording = OUR_WORDIN
         name=path.stem,
         folder=re.sub(r"[^\w.-]", "_", path.resolve().parent.name),  # for a label
         note=" ".join(note.split()),
-        has_steps="n_pixels" in cells.index.names,
+        has_steps=cells.index.names[0] == "tracker",
         has_std=any(cell.std for cell in cells.to_numpy().flat),
         has_converged=any("‡" in cell.value for cell in cells.to_numpy().flat),
         columns=list(cells),

@@ -27,6 +27,8 @@ STANDING_STILL = "standing still"
 CONVERGED = "‡"  # marks steps in Table II after which the tracker had converged
 _CELL_1 = ["rate_hz", "method", "scene"]
 _CELL_2 = ["tracker", "n_pixels", "budget_ms"]
+_HEADS = {"rate_hz": "rate (Hz)", "n_pixels": "pixels a step", "budget_ms": "time a frame (ms)"}
+_HEADS["scene"] = None  # names of scenes speak for themselves
 _MISSING = "–"
 _BOLD = "font-weight: bold;"
 _LEGEND = f"bold: best at this rate; † and red: above {LOST_THRESHOLD_M:g} m"
@@ -165,13 +167,13 @@ class Cell:
 
 
 class TableStyler(Styler):
-    """A styled table of `Cell`s. As plain text it is the table, which is the same in every run."""
+    """A styled table of `Cell`s. As plain text it has the page's labels, the same in every run."""
 
     unit = "m"  # of the ATEs in Table I or III
     default_pixels = PAPER_PIXELS  # the n of each tracker that Table II prints in bold
 
     def __repr__(self) -> str:
-        return self.data.map(str).to_string()
+        return self.data.map(str).rename(index=_label, columns=_label).to_string()
 
 
 def style_table_1(
@@ -190,8 +192,6 @@ def style_table_1(
     stds = _texts(scale * table_1(results, "ate_std_m"), form)
     styler = _styled(_texts(shown, form, _MISSING), stds, is_best, shown > scale * LOST_THRESHOLD_M)
     styler.unit = unit
-    styler.format_index("{:g} Hz", level="rate_hz")
-    styler.format_index(escape="html", level="method").format_index(escape="html", axis="columns")
     return _labelled(styler, caption, _LEGEND)
 
 
@@ -212,12 +212,11 @@ def style_table_2(
     styler = _styled(texts, _texts(stds, "{:.1f}"), is_best=False, is_lost=False)
     styler.default_pixels = default_pixels
     is_default = [default_pixels.get(tracker) == n for tracker, n in wide.index]
-    styler.format_index("{:g} ms", axis="columns")
     labels = ["<b>{} *</b>" if default else "{}" for default in is_default]
-    styler.relabel_index(labels, level="n_pixels")
+    styler.relabel_index(labels, level=1)
     # Notebooks show every row label in bold, so the others are set to normal weight.
     weights = [_BOLD if default else "font-weight: normal;" for default in is_default]
-    styler.apply_index(lambda labels: weights, axis="index", level="n_pixels")
+    styler.apply_index(lambda labels: weights, axis="index", level=1)
     ended = f"; {CONVERGED}: until it converged, with time left" if has_ended.any(axis=None) else ""
     return _labelled(styler, caption, f"* and bold: the n used for tracking{ended}")
 
@@ -230,8 +229,16 @@ def _texts(wide: pd.DataFrame, form: str, missing: str = "") -> pd.DataFrame:
 def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best: Any, is_lost: Any) -> TableStyler:
     """A styled table of `Cell`s; marks are tables of flags shaped as `texts`, or one flag each."""
     cells = np.vectorize(Cell, otypes=[object])(texts, stds, is_best, is_lost)
-    styler = TableStyler(pd.DataFrame(cells, texts.index, texts.columns))
+    table = pd.DataFrame(cells, texts.index, texts.columns)
+    styler = TableStyler(table.rename_axis(index=_HEADS, columns=_HEADS))
+    for axis in ("index", "columns"):
+        styler.format_index(_label, axis=axis, escape="html")
     return styler.format(Cell.html).map(Cell.css)
+
+
+def _label(label: object) -> str:
+    """The label of a row or column as text: 10.0 is 10, and a scene's name has spaces."""
+    return f"{label:g}" if isinstance(label, float) else str(label).replace("_", " ")
 
 
 def _labelled(styler: TableStyler, caption: str | None, legend: str) -> TableStyler:
