@@ -27,8 +27,8 @@ STANDING_STILL = "standing still"
 CONVERGED = "‡"  # marks steps in Table II after which the tracker had converged
 _CELL_1 = ["rate_hz", "method", "scene"]
 _CELL_2 = ["tracker", "n_pixels", "budget_ms"]
-_HEADS = {"rate_hz": "rate (Hz)", "n_pixels": "pixels a step", "budget_ms": "time a frame (ms)"}
-_HEADS["scene"] = None  # names of scenes speak for themselves
+_HEADS = {"rate_hz": "rate (Hz)", "scene": None}  # names of scenes speak for themselves
+_HEADS |= {"n_pixels": "pixels a step", "budget_ms": "time a frame (ms)"}
 _MISSING = "–"
 _BOLD = "font-weight: bold;"
 _LEGEND = f"bold: best at this rate; † and red: above {LOST_THRESHOLD_M:g} m"
@@ -231,8 +231,7 @@ def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best: Any, is_lost: Any)
     cells = np.vectorize(Cell, otypes=[object])(texts, stds, is_best, is_lost)
     table = pd.DataFrame(cells, texts.index, texts.columns)
     styler = TableStyler(table.rename_axis(index=_HEADS, columns=_HEADS))
-    for axis in ("index", "columns"):
-        styler.format_index(_label, axis=axis, escape="html")
+    styler.format_index(_label, escape="html").format_index(_label, escape="html", axis="columns")
     return styler.format(Cell.html).map(Cell.css)
 
 
