@@ -1,7 +1,6 @@
 """The paper's tables: long DataFrames in; wide DataFrames, styled HTML, LaTeX and CSV out.
 
-Experiments and CSV files use the long form, in which each row is one result. The wide form is the
-printed table. Its rows follow the data: a new tracker is a new row, and no code here names one.
+A row of the long form is one result. The wide form is printed: a new tracker is a new row of it.
 """
 
 import html
@@ -27,8 +26,7 @@ STANDING_STILL = "standing still"
 CONVERGED = "‡"  # marks steps in Table II after which the tracker had converged
 _CELL_1 = ["rate_hz", "method", "scene"]
 _CELL_2 = ["tracker", "n_pixels", "budget_ms"]
-_HEADS = {"rate_hz": "rate (Hz)", "scene": None}  # names of scenes speak for themselves
-_HEADS |= {"n_pixels": "pixels a step", "budget_ms": "time a frame (ms)"}
+_HEADS = {"rate_hz": "rate (Hz)", "n_pixels": "pixels a step", "budget_ms": "time a frame (ms)"}
 _MISSING = "–"
 _BOLD = "font-weight: bold;"
 _LEGEND = f"bold: best at this rate; † and red: above {LOST_THRESHOLD_M:g} m"
@@ -181,9 +179,8 @@ def style_table_1(
 ) -> TableStyler:
     """Table I, mean ± std over seeds: best bold, above 0.2 m red with a dagger, missing "–".
 
-    Marks depend on the digits printed, three in m and one in mm, so that values printed alike are
-    marked alike. A value without a rival in its scene at its rate is not bold. Raises ConfigError
-    for another unit than "m" or "mm". Source: caption of the paper's Table I.
+    Marks depend on the digits printed, three in m, one in mm. A value without a rival in its scene
+    at its rate is not bold. ConfigError: another unit. Source: caption of the paper's Table I.
     """
     scale, form = look_up("unit", unit, _UNITS)
     shown = (scale * table_1(results)).map(lambda value: float(form.format(value)))
@@ -212,8 +209,7 @@ def style_table_2(
     styler = _styled(texts, _texts(stds, "{:.1f}"), is_best=False, is_lost=False)
     styler.default_pixels = default_pixels
     is_default = [default_pixels.get(tracker) == n for tracker, n in wide.index]
-    labels = ["<b>{} *</b>" if default else "{}" for default in is_default]
-    styler.relabel_index(labels, level=1)
+    styler.relabel_index(["<b>{} *</b>" if bold else "{}" for bold in is_default], level=1)
     # Notebooks show every row label in bold, so the others are set to normal weight.
     weights = [_BOLD if default else "font-weight: normal;" for default in is_default]
     styler.apply_index(lambda labels: weights, axis="index", level=1)
@@ -230,7 +226,7 @@ def _styled(texts: pd.DataFrame, stds: pd.DataFrame, is_best: Any, is_lost: Any)
     """A styled table of `Cell`s; marks are tables of flags shaped as `texts`, or one flag each."""
     cells = np.vectorize(Cell, otypes=[object])(texts, stds, is_best, is_lost)
     table = pd.DataFrame(cells, texts.index, texts.columns)
-    styler = TableStyler(table.rename_axis(index=_HEADS, columns=_HEADS))
+    styler = TableStyler(table.rename_axis(index=_HEADS, columns=_HEADS.get))  # none for scenes
     styler.format_index(_label, escape="html").format_index(_label, escape="html", axis="columns")
     return styler.format(Cell.html).map(Cell.css)
 
