@@ -102,15 +102,15 @@ def test_places_are_told_before_the_work(work: Path, capsys) -> None:
 
 def test_a_flipped_bit_in_a_checkpoint_is_noticed(tmp_path: Path) -> None:
     """Catches a run that goes on from a damaged checkpoint to another trajectory."""
-    path = tmp_path / "map" / "mapping.pt"
-    files.save_checkpoint(path, {"weights": torch.arange(1000.0), "rows": [1, 2]})
-    with files.loaded_checkpoint(path) as state:
-        assert state["rows"] == [1, 2]
-    content = bytearray(path.read_bytes())
+    file, state = files.Checkpoint(tmp_path / "map" / "mapping.pt", {"rows": [1, 2]}), {}
+    file.save(lambda: {"weights": torch.arange(1000.0)}, is_last=True)
+    file.resume(state.update)
+    assert state["recipe"] == {"rows": [1, 2]}
+    content = bytearray(file.path.read_bytes())
     content[len(content) // 2] ^= 1
-    path.write_bytes(content)
-    with pytest.raises(DataError, match="not a readable"), files.loaded_checkpoint(path):
-        pass
+    file.path.write_bytes(content)
+    with pytest.raises(DataError, match="not a readable"):
+        file.resume(state.update)
 
 
 def test_tables_do_not_touch_the_evidence(tmp_path: Path, capsys) -> None:

@@ -105,20 +105,6 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     write_atomic(path, buffer.getvalue())
 
 
-@contextlib.contextmanager
-def loaded_checkpoint(path: Path) -> Iterator[dict[str, Any]]:
-    """Give a `with` block the state that `save_checkpoint` wrote, its tensors on the CPU.
-
-    Raises DataError if the file is damaged. An error within the block becomes a DataError too: it
-    means that the file does not hold what the block restores from it.
-    """
-    with naming_damaged(path):
-        with zipfile.ZipFile(path) as archive:
-            if damaged := archive.testzip():  # compares the checksums, which `torch.load` does not
-                raise ValueError(f"{damaged} is not what was written")
-        yield torch.load(path, map_location="cpu", weights_only=True)
-
-
 def digest_of(plain: Any, tensors: Mapping[str, torch.Tensor]) -> str:
     """SHA-256 (hexadecimal) over plain values and named tensors, whatever the order of names."""
     digest = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
@@ -152,13 +138,19 @@ class Checkpoint:
             self.last_saved = time.perf_counter()
 
     def resume(self, take_up: Callable[[dict[str, Any]], None]) -> None:
-        """Call `take_up` with the written state, if there is one.
+        """Call `take_up` with the written state, if there is one; its tensors are on the CPU.
 
-        Raises DataError if the file is damaged, or if a run with another recipe wrote it.
+        Raises DataError if the file is damaged, or if a run with another recipe wrote it. An error
+        in `take_up` becomes a DataError too: the file does not hold what is restored from it.
         """
         if not (self.path and self.path.exists()):
             return
-        with loaded_checkpoint(self.path) as state:
+        with naming_damaged(self.path):
+            with zipfile.ZipFile(self.path) as archive:
+                damaged = archive.testzip()  # compares the checksums, which `torch.load` does not
+            if damaged:
+                raise ValueError(f"{damaged} is not what was written")
+            state = torch.load(self.path, map_location="cpu", weights_only=True)
             written = state["recipe"]
             others = [name for name in self.recipe if written.get(name) != self.recipe[name]]
             if others:
