@@ -153,12 +153,6 @@ def convergence(scores: pd.DataFrame) -> pd.DataFrame:
     return shown(first, {"iterations": ("iterations", "{:.0f}"), "seconds": ("s", "{:.0f}")})
 
 
-def image_size(times: pd.DataFrame) -> pd.DataFrame:
-    """Milliseconds and error (cm) of a frame, by the width of its picture."""
-    times = times.set_index(times["width"].map("{:g} px wide".format)).eval("cm = 100 * error_m")
-    return shown(times, {"milliseconds": ("ms a frame", "{:.1f}"), "cm": ("cm", "{:.2f}")}).T
-
-
 def ten_seconds(rounds: pd.DataFrame) -> pd.DataFrame:
     """Seconds of a core for mapping a recording and correcting the map; medians of the rounds."""
     rounds = rounds.eval("both_s = mapping_s + correction_s")
@@ -238,7 +232,6 @@ TABLES = {
     "times": (times, "paper_tables/corrected/times.csv"),
     "searches": (searches, "paper_tables/corrected/searches.csv"),
     "fast": (fast, "paper_tables/corrected/fast.csv"),
-    "image_size": (image_size, "paper_tables/corrected/image_size.csv"),
     "ten_seconds": (ten_seconds, "paper_tables/corrected/mapping.csv"),
     "memory": (memory, "benchmarks/cpu/memory.csv"),
     "ablation": (ablation, "paper_tables/corrected/ablation.csv"),
