@@ -23,7 +23,7 @@ _WATCHING = threading.Lock()
 _WAITS = "called a synchronizing CUDA operation"  # in PyTorch's warning of a wait for the GPU
 
 
-class Recording:
+class RepeatedWork:
     """Does work by calling it; on CUDA, after a few calls, by replaying a recorded graph of it.
 
     The work must always read and write the same tensors, and draw random numbers from `generator`

@@ -19,7 +19,7 @@ from nbtrack.machinery.device import advise_on_memory, device_name, suited_to, t
 from nbtrack.machinery.errors import ConfigError, NumericalError, check_argument, typed
 from nbtrack.machinery.files import Checkpoint
 from nbtrack.machinery.inputs import whole_number
-from nbtrack.machinery.launches import Recording, make_adam
+from nbtrack.machinery.launches import RepeatedWork, make_adam
 from nbtrack.machinery.settings import checked
 from nbtrack.mapping.files import Map
 from nbtrack.mapping.holdout import split_holdout, usual_misfit
@@ -116,7 +116,7 @@ class _Fit:
         self.generator = torch.Generator(field.device).manual_seed(recipe["seed"])
         self.sampler = PixelSampler(seen, field.device)
         self.frames = torch.from_numpy(mapped).to(field.device)
-        self.recording = Recording(f"mapping {field.name}", self.generator)
+        self.descent = RepeatedWork(f"mapping {field.name}", self.generator)
         field.prepare(seen, mapped)
         self.seconds = 0.0
         self.history = []
@@ -139,7 +139,7 @@ class _Fit:
         pending = []
         for iteration in iterations:
             self.rate.fill_(learning_rate(self.settings, iteration))
-            pending.append(self.recording.run(self._descend))
+            pending.append(self.descent.run(self._descend))
         diagnostics = self.field.diagnostics()  # after the last of the steps; recorded with each
         for iteration, row in zip(iterations, torch.stack(pending).tolist(), strict=True):
             values = dict(zip(self.terms, row, strict=True))

@@ -11,7 +11,7 @@ from nbtrack.core.camera import pixel_directions
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
 from nbtrack.fields.base import rendered_losses
-from nbtrack.machinery.launches import Recording, make_adam
+from nbtrack.machinery.launches import RepeatedWork, make_adam
 from nbtrack.machinery.settings import limited, one_of
 from nbtrack.tracking.reach import Reach, reach
 from nbtrack.tracking.tracker import Tracker, TrackerSettings
@@ -89,7 +89,7 @@ class AdamTracker(Tracker):
     def step(self) -> Scalar:
         """Draw pixels and take one step of Adam on their loss; returns the loss before the step."""
         self._choose_pixels()
-        return self.recording.run(self._descend)
+        return self.descent.run(self._descend)
 
     def _allocate(self, frame: Frame) -> None:
         """Allocate all tensors that steps read and change, for frames of one camera."""
@@ -101,7 +101,7 @@ class AdamTracker(Tracker):
         position = {"params": [self.position], "lr": position_rate}
         orientation = {"params": [self.q_wxyz], "lr": self.settings.orientation_rate}
         self.optimizer = make_adam([position, orientation], self.device)
-        self.recording = Recording(f"tracker {self.name}", self.generator)
+        self.descent = RepeatedWork(f"tracker {self.name}", self.generator)
 
     def _descend(self) -> Scalar:
         """Take one step of Adam on the chosen pixels; returns the loss before it."""
