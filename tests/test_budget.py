@@ -16,14 +16,19 @@ class FakeClock:
         self.seconds = 1000.0
         self.budget = ClockBudget(rate_hz, lambda: self.seconds)
 
-    def steps(self, *durations: float) -> int:
-        """Steps of the next frame, when its steps last this long; the last duration repeats."""
+    def steps(self, *durations: float, last: int = 99) -> int:
+        """Steps of the next frame, when its steps last this long, of which the last repeats; after
+        `last` steps it has converged."""
         count = 0
         self.seconds += 10.0  # what the next image takes to load is free
-        for step in self.budget.frame():
+        frame = self.budget.frame()
+        for step in frame:
             assert step == count
             self.seconds += durations[min(step, len(durations) - 1)]
             count += 1
+            if count == last:
+                break
+        frame.close()
         return count
 
 
@@ -48,16 +53,7 @@ def test_a_converged_step_counts() -> None:
     """Catches a search that ends in its first step, as ICP's does, and is never charged for it: of
     50 ms a step at 1,000 Hz every other frame has none, as where nothing converges."""
     clock = FakeClock(1000)
-    counts = []
-    for _ in range(5):
-        frame = clock.budget.frame()
-        counts.append(0)
-        for step in frame:
-            clock.seconds += 1 / 16
-            counts[-1] = step + 1
-            break
-        frame.close()
-    assert counts == [1, 0, 1, 0, 1]
+    assert [clock.steps(1 / 16, last=1) for _ in range(5)] == [1, 0, 1, 0, 1]
 
 
 def test_mean_is_over_the_whole_frame() -> None:

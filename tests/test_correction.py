@@ -151,7 +151,8 @@ def error_m(found: Estimate, frame: Frame) -> float:
 
 def test_a_kidnapped_camera_is_found(found: CorrectedField, sequence: RgbdSequence) -> None:
     """Catches a tracker that looks only around where it last was: it is teleported half a turn
-    away, where the map's own cameras stand 30 degrees apart."""
+    away, where the map's own cameras stand 30 degrees apart; and a first pose that is trusted
+    although nobody knows it."""
     tracker = tracked(found, sequence.T_world_camera[7])
     assert not tracker.track(sequence[7]).lost
     for number in (1, 2):
@@ -160,6 +161,8 @@ def test_a_kidnapped_camera_is_found(found: CorrectedField, sequence: RgbdSequen
         assert estimate.lost is (estimate.report["p_lost"] >= 0.5)
     assert not estimate.lost
     assert estimate.report["p_lost"] < 0.1
+    tracker.restart_anywhere()
+    assert tracker.was_lost
 
 
 def test_a_covered_camera_is_lost(found: CorrectedField, sequence: RgbdSequence) -> None:

@@ -71,7 +71,7 @@ def poses_with(pose) -> np.ndarray:
 SDF = METHODS["sdf"]
 DENSITY = make_field("imap", NETWORK, SceneBounds(*UNIT), 0)
 REFUSED = {
-    "zero pose": lambda: tracker(pose=np.zeros((4, 4))),
+    "mirrored pose": lambda: tracker(pose=np.diag([1.0, 1.0, -1.0, 1.0])),
     "zero pose for a picture": lambda: DENSITY.render_view(CAMERA, np.zeros((4, 4))),
     "part of a pixel": lambda: tracker(n_pixels=16.7),
     "part of a seed": lambda: mapped(seed=0.5),

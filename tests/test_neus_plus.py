@@ -7,7 +7,7 @@ import pytest
 import torch
 from box_room import room_sequence, sequence_of
 
-from nbtrack import load_preset, read_map, write_map
+from nbtrack import read_map, write_map
 from nbtrack.beyond.neus_plus import (
     FeatureGrid,
     GridNetwork,
@@ -22,7 +22,6 @@ from nbtrack.data.pixels import PixelSampler, Rays
 from nbtrack.data.sequence import RgbdSequence, observed_bounds
 from nbtrack.fields import NetworkSettings
 from nbtrack.fields.neus import guided_depths
-from nbtrack.machinery.errors import ConfigError
 from nbtrack.mapping.fit import map_sequence
 from nbtrack.synthetic import build_room
 
@@ -141,9 +140,3 @@ def test_features_by_hand() -> None:
     hidden = torch.nn.functional.silu(grid.layer(torch.cat([*expected, normalized])))
     torch.testing.assert_close(grid.features(vertex)[0], hidden)
     assert grid.layer.weight.std().item() == pytest.approx(15**-0.5, rel=0.15)
-
-
-def test_the_eikonal_term_of_grids_is_refused() -> None:
-    """Catches a setting that ends in the middle of mapping: grids have no second derivative."""
-    with pytest.raises(ConfigError, match="lambda_eikonal"):
-        load_preset(settings=["mapping.grid_plus.lambda_eikonal=0.1"])
