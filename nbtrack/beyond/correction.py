@@ -93,6 +93,7 @@ class CorrectedField(BakedField):
 
         `made`, the record of the map, has the voxel (m) as "correction": `correct_map` wrote it.
         """
+        # The tensors of the learned field, by the names that they have in this field.
         source = {n.removeprefix(_SOURCE): x for n, x in state.items() if n.startswith(_SOURCE)}
         mapped = field_class(made["field"]).from_state(source, made, bounds)
         field = cls(mapped, voxel=float(made["correction"]))

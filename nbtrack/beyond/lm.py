@@ -136,7 +136,7 @@ class LmTracker(Tracker):
         # `descent_from(T)` begins a descent for this frame's pose at the start T.
         self.descent_from = partial(LmOptimizer, self.grid, coarse, observed, self.intensity_weight)
         descents = [self.descent_from(T) for T in starts]
-        if np.abs(starts - starts[0]).max() > _FAR_APART:
+        if np.abs(starts - starts[0]).max() > _FAR_APART:  # compared after their coarse stages
             for descent in descents:
                 descent.run_stage(max_steps=30)
         self.best, *_ = _by_cost(descents)

@@ -125,7 +125,7 @@ def residual_terms(problem: Problem, T: Pose) -> Terms:
             c00, c01 = c000 + z * (c001 - c000), c010 + z * (c011 - c010)
             c10, c11 = c100 + z * (c101 - c100), c110 + z * (c111 - c110)
             c0, c1 = c00 + y * (c01 - c00), c10 + y * (c11 - c10)
-            if k == 2:
+            if k == 2:  # the confidence, whose derivatives are not used
                 reliability[i] *= c0 + x * (c1 - c0)
                 break
             # Derivatives along z at low x and at high x, interpolated along y.

@@ -116,10 +116,12 @@ def retract(T: Pose, twist: Array) -> Pose:
     """The pose after a twist (omega in rad, v in m; world axes), by Rodrigues' formula."""
     x, y, z = twist[0], twist[1], twist[2]
     angle = np.sqrt(x * x + y * y + z * z)
+    # Near 0 both have their limits: sin(angle) / angle, and (1 - cos(angle)) / angle^2.
     sine = np.sin(angle) / angle if angle > 1e-9 else 1.0
     versine = 2 * (np.sin(angle / 2) / angle) ** 2 if angle > 1e-9 else 0.5
     after = T.copy()
-    # With w = omega an axis a of the camera turns into a + sine w x a + versine w x (w x a).
+    # A column of the rotation is an axis u = (a, b, c) of the camera. With w = (x, y, z) it turns
+    # into u + sine w x u + versine w x (w x u), and w x u = (p, q, r).
     for k in range(3):
         a, b, c = T[0, k], T[1, k], T[2, k]
         p, q, r = y * c - z * b, z * a - x * c, x * b - y * a

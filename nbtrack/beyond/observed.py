@@ -91,6 +91,8 @@ def _drawn_points(
     for order in range(n_looked_at):
         if n_drawn == n_points:
             break
+        # The fractional part, in units of 1 / _MODULUS, times the number of rows that are not at
+        # the border; and likewise of columns.
         v = 1 + (starts[0] + _EVEN_STEPS[0] * order) % _MODULUS * (height - 2) // _MODULUS
         u = 1 + (starts[1] + _EVEN_STEPS[1] * order) % _MODULUS * (width - 2) // _MODULUS
         z = depth_mm[v, u]  # mm

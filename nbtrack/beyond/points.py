@@ -88,8 +88,8 @@ def fuse_points(
 
     A point is the mean position (m, world frame) and colour (in [0, 1]) of a voxel's pixels, which
     reduces noise. Every `stride`-th pixel along both axes is used, if it lies inside the bounds.
-    Voxels with fewer than `min_count` pixels have no point, unless all have fewer.
-    Raises ConfigError for a voxel (m) that is not positive, far too fine, or longer than the scene.
+    Voxels with fewer than `min_count` pixels have no point. If all have fewer, those with the most
+    have one. Raises ConfigError for a voxel (m) that is far too fine, or longer than the scene.
     """
     extent = np.subtract(bounds.maximum, bounds.minimum)
     if not extent.max() / _MAX_CELLS_A_SIDE <= voxel <= extent.max():

@@ -86,8 +86,9 @@ def fit_all(pairs: FramePairs, as_declared: Reading) -> tuple[list[Convention], 
 
     The declared convention comes first. It is the best one unless another is clearly better.
     """
-    # Axes can be declared by a name or by three words. `_hypotheses` has names where there are any.
-    # Here, too, so that the declared reading is recognised there, and is not compared twice.
+    # Axes can be declared by a name, such as opengl, or by three words. Here they get their name if
+    # they have one, as in `_hypotheses`. So the declared reading is found among the hypotheses, and
+    # is not compared twice.
     names = {words: name for name, words in SPELLED_AXES.items()}
     axes = names.get(as_declared.declared.camera_axes, as_declared.declared.camera_axes)
     as_declared = replace(as_declared, declared=replace(as_declared.declared, camera_axes=axes))
@@ -156,8 +157,8 @@ def _best_of(conventions: list[Convention]) -> Convention:
 
     This candidate is clearly better if its mean gap is three times smaller than the declared one's,
     or if its mean gap is smaller and clearly more points agree. The number of points alone is not
-    enough: as many agree if positions are mirrored along an axis along which the camera hardly
-    moved, or along which it looks.
+    enough: as many or more agree if positions are mirrored along an axis along which the camera
+    hardly moved, or along which it looks.
     """
     declared = conventions[0]
     near, far = PLAUSIBLE_DEPTH

@@ -141,7 +141,7 @@ def of_images(
 def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
     """A fault if some poses lie beside the path of their neighbours.
 
-    Call it only if the declared convention is the best one: others distort the path.
+    Call it only if the declared convention is the best one: the path is distorted under others.
     """
     off = frames.off_mm / 1e3  # m
     is_odd = off > max(_OFF, _OFF_STEPS * frames.moved_mm.median() / 1e3)

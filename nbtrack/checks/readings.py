@@ -211,8 +211,8 @@ class FramePairs:
         """Poses of the first camera of each pair in the second camera's frame, (pairs, 4, 4; m)."""
         T_world_camera = reading.T_world_camera(self.file_poses, self.order)
         if reading.late:
-            # Depth that comes `late` frames after its pose was seen from an earlier pose, which
-            # lies between those of two frames.
+            # The depth image of frame k was taken at the time k - late, when the camera was between
+            # the poses of two frames. That pose is interpolated.
             numbers = np.arange(len(T_world_camera))
             times = (numbers - reading.late).clip(0, numbers[-1])  # in frames
             R, t = Rotation.from_matrix(T_world_camera[:, :3, :3]), T_world_camera[:, :3, 3]

@@ -98,8 +98,7 @@ class NeuSField(LearnedField):
         inputs. Here the last layer, which is linear, is fitted by least squares at random points in
         the box to the distance from its nearest face (our choice).
         """
-        corners = [self.bounds.minimum, self.bounds.maximum]
-        low, high = torch.tensor(corners, dtype=torch.float32)
+        low, high = torch.tensor([self.bounds.minimum, self.bounds.maximum], dtype=torch.float32)
         drawn = torch.rand(8192, 3, generator=generator, dtype=torch.float32)
         points = low + (high - low) * drawn  # m, world frame, uniform in the box
         target = torch.minimum(points - low, high - points).amin(dim=1)  # m, to the nearest face

@@ -17,10 +17,10 @@ def expected_poses(motion_model: str, estimates: list[Pose]) -> list[Pose]:
     any other model.
     """
     last = estimates[-1]
-    models = {model: [last] for model in ("previous_pose", "better_of_both", "constant_velocity")}
-    if len(estimates) > 1:  # after a single pose no velocity is known
+    models = {model: [last] for model in ("previous_pose", "constant_velocity", "better_of_both")}
+    if len(estimates) > 1:  # after a single pose no velocity is known: all start there
         moved_on = last @ np.linalg.inv(estimates[-2]) @ last
-        models |= {"better_of_both": [moved_on, last], "constant_velocity": [moved_on]}
+        models |= {"constant_velocity": [moved_on], "better_of_both": [moved_on, last]}
     return look_up("motion model", motion_model, models)
 
 

@@ -71,7 +71,7 @@ def track_sequence(
             rows.append(_row(sequence, index, tracker.track(sequence[index], budget)))
             on_frame(index, rows[-1]["translation_error_m"])
             file.save(lambda: {"rows": rows, "tracker": tracker.state()})
-    T_estimated = np.stack(tracker.estimates[1:])  # the first is the start, no tracked frame
+    T_estimated = np.stack(tracker.estimates[1:])  # the first estimate is the start, not a frame's
     return Trajectory(T_estimated, sequence.T_world_camera[first:].copy(), _table_of(rows))
 
 
