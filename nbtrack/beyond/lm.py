@@ -96,7 +96,7 @@ class LmTracker(Tracker):
         return on_host
 
     def restart_anywhere(self) -> None:
-        """Let the next frame be tracked as lost, anywhere near the poses the map was made from."""
+        """Let the next frame be searched for as a lost one, near all poses of the mapped frames."""
         self.check_finds(in_corrected=self.field.viewpoints is not None)
         self.restart(self.field.viewpoints.T_world_camera[0])  # any pose would do: none is trusted
         self.was_lost = True  # after `restart`, which resets it

@@ -205,9 +205,9 @@ def _read(
             part = read_frames(recording, part_ids, as_stored=True)
             for values, color in zip(part.depths_mm, part.colors, strict=True):
                 step = np.gcd.reduce(values, axis=None)
-                of_frame = np.bincount(values.ravel(), minlength=65536)
-                counts[0] += of_frame
-                counts[1] += of_frame > findings.SHARED * values.size
+                n_pixels = np.bincount(values.ravel(), minlength=65536)  # by depth value
+                counts[0] += n_pixels
+                counts[1] += n_pixels > findings.SHARED * values.size
                 rows.append(((values > 0).mean(), color.mean() / 255, step, zlib.crc32(values)))
             parts.append(part.select(np.isin(part_ids, ids_kept)))
             if len(ids) > _FRAMES_AT_ONCE:  # a single part is kept: mapping reads it again
@@ -217,7 +217,7 @@ def _read(
     frames = pd.DataFrame(rows, ids, ["measured", "brightness", "depth_step", "checksum"])
     frames["is_repeated"] = frames.pop("checksum").diff() == 0
     _add_motion(frames, recording.T_world_camera)
-    counts[:, 0] = 0  # no depth
+    counts[:, 0] = 0  # the value 0 is no depth
     return replace(parts[0], **arrays), frames, counts
 
 

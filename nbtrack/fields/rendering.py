@@ -34,8 +34,8 @@ def weights_from_density(
 
     Densities are in 1/m, z-depths (ascending) in m. `ray_lengths` are the lengths of the ray
     directions, and delta_i is the distance (m) from sample i to the next one along the ray. The
-    last sample has no next one and takes the delta of the sample before it (our choice: so a wall
-    stays opaque, and free space free). Source: Sucar et al. 2021 (iMAP), Sec. 3.2.
+    last sample has no next one, and takes the delta of the sample before it. So a wall there is
+    opaque, and free space there is not (our choice). Source: Sucar et al. 2021 (iMAP), Sec. 3.2.
     """
     z_steps = depths.diff()
     sections = torch.cat([z_steps, z_steps[:, -1:]], dim=1) * ray_lengths[:, None]

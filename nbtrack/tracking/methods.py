@@ -63,7 +63,7 @@ METHODS: Registry[Method] = Registry(_OF_PAPER)
 
 @typed
 def find_methods(methods: Methods) -> list[Method]:
-    """The methods of a list of names and `Method` objects, in order, each once.
+    """The methods of a list of names and `Method` objects, in order. Repetitions are left out.
 
     Raises ConfigError if `methods` is no list, if an entry is neither a known name nor a `Method`,
     or if a method's tracker does not work in its field.

@@ -149,9 +149,9 @@ class Tracker(abc.ABC):
     def track(self, frame: Frame, budget: Budget | None = None) -> Estimate:
         """Estimate the camera's pose at the next frame. Raises NumericalError if it is not finite.
 
-        A budget given here replaces the tracker's own for this frame. If no depth is measured, a
-        tracker that needs depth returns the pose that the motion model predicts, so that later
-        frames can still be found (our choice).
+        A budget that is given here replaces the tracker's own for this frame. If no depth is
+        measured, a tracker that needs depth does not search. It returns the first pose of the
+        motion model, so that later frames can still be found (our choice).
         """
         T_starts = np.stack(expected_poses(self.settings.motion_model, self.estimates))
         estimate = Estimate(rigid(T_starts[0]), without_depth=True)
