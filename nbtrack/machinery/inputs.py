@@ -17,7 +17,6 @@ from torch import Tensor
 from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.machinery.files import naming_damaged
 
-Poses = Float[np.ndarray, "_ 4 4"]
 _FARTHEST = 1e7  # m from the origin: beyond geographic coordinates; floats can square it
 # A pose is wrong if its distance from the median position is more than so many times the distance
 # within which nine in ten poses lie, or more than so many metres, whichever is larger.
@@ -133,7 +132,7 @@ def checked_pose(T_world_camera: Any) -> Float[np.ndarray, "4 4"]:
     return checked_poses(pose[None], Path("T_world_camera"))[0]
 
 
-def checked_poses(poses: Poses, path: Path) -> Poses:
+def checked_poses(poses: Float[np.ndarray, "_ 4 4"], path: Path) -> Float[np.ndarray, "_ 4 4"]:
     """Check the poses (m) of a file's frames; returns them with NaN for frames that have none.
 
     A frame has no pose if a number of its matrix is not finite, or if the first three rows are 0.
