@@ -138,7 +138,8 @@ def test_depth_folder_and_pose_file_are_chosen(scene: Path) -> None:
 
 
 def test_poses_of_a_plain_folder(plain: Path) -> None:
-    """Catches pose files of one shape read as another."""
+    """Catches pose files of one shape read as another, and a single frame whose time, as that of
+    its pose, is not a number."""
     T = source().poses
     (plain / "poses").mkdir()
     (plain / "trajectory.txt").unlink()
@@ -155,6 +156,8 @@ def test_poses_of_a_plain_folder(plain: Path) -> None:
         check_equal(read_sequence(plain), source())
         for name in texts:
             (plain / name).unlink()
+    one = recordings.write_matrices(plain.parent / "one", source(n_frames=1))
+    assert open_recording(one).times == [0]
 
 
 ENCODINGS = 2 * ["utf-16", "utf-8-sig", "utf-32", "utf-16-le"]
