@@ -48,8 +48,8 @@ def tracker_in(room: Room, n_pixels: int = 512) -> Tracker:
 
 
 def test_points_of_a_voxel_are_averaged(monkeypatch) -> None:
-    """Catches sums that are not divided, voxels mixed up, and a mean of means, where frames are
-    merged in blocks: the mean is worked out by hand."""
+    """Catches sums that are not divided, voxels mixed up, a mean of means, where frames are merged
+    in blocks, and voxels of fewer points than are asked for: the mean is worked out by hand."""
     monkeypatch.setattr("nbtrack.beyond.points._FRAMES_AT_ONCE", 2)
     # Left pixel: x = -z/4. 2.02 to 2.07 m fall into one voxel of 10 cm, 2.50 m into another.
     depths_mm, shades = [2020, 2030, 2070, 2500], [50, 150, 100, 255]
@@ -59,6 +59,8 @@ def test_points_of_a_voxel_are_averaged(monkeypatch) -> None:
     order = points[:, 2].argsort()
     np.testing.assert_allclose(points[order], [[-0.51, 0, 2.04], [-0.625, 0, 2.5]], atol=1e-6)
     np.testing.assert_allclose(colors[order], [[100 / 255] * 3, [1.0] * 3], atol=1e-6)
+    fewest = [fuse_points(sequence, np.arange(4), BOX, 0.1, 1, n).points for n in (1, 3, 9)]
+    assert [*map(len, fewest)] == [2, 1, 1]  # the fullest one stays
 
 
 def test_only_the_frames_asked_for_and_what_lies_inside_are_fused() -> None:

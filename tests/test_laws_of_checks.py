@@ -11,7 +11,7 @@ from box_room import poses_at, sequence_of
 
 from nbtrack.checks import findings
 from nbtrack.checks.conventions import Convention, _best_of
-from nbtrack.checks.misfits import Misfit, _normal_equations, _solution
+from nbtrack.checks.misfits import Misfit, _best_start, _normal_equations, _solution
 from nbtrack.checks.readings import FramePairs, Reading, cost_of, mean_apart
 from nbtrack.core.camera import Intrinsics
 from nbtrack.recordings.formats import Declaration
@@ -202,6 +202,17 @@ def test_a_step_of_a_fit_by_hand() -> None:
     np.testing.assert_allclose(H[:, 0, 1], (weights * slopes[0] * slopes[1]).sum(axis=1))
     assert cost_of(np.array([[0.004, np.nan, -0.012]])) == pytest.approx((0.5 + 0.9) / 2)
     assert mean_apart(np.array([[0.01, np.nan, -0.3]])) == pytest.approx((0.01 + 0.05) / 2)
+
+
+def test_where_a_fit_begins() -> None:
+    """Catches a number that is sought near the declared one alone, starts of several numbers, and
+    one that is taken although hardly more areas agree."""
+    one, two = np.zeros(1), np.zeros(2)
+    found = [
+        _best_start(values, values + 1.0, lambda tried, far=far: np.full((1, 24), tried[0] - far))
+        for values, far in ((one, 0.65), (two, 0.65), (one, 0.005))
+    ]
+    assert [*map(float, np.concatenate(found))] == pytest.approx([0.643, 0, 0, 0], abs=1e-3)
 
 
 def ends_of(
