@@ -131,7 +131,7 @@ def test_a_file_keeps_it_whole(tmp_path: Path, sequence: RgbdSequence) -> None:
     made |= {"scene": "box", "n_frames": len(sequence), "origin": [0.0, 0.0, 0.0]}
     made["settings"] = asdict(NeusMapping())
     finished = correct_map(Map(field, sequence.intrinsics, made), sequence, 0.2)
-    assert finished.record["seconds"] == 5 + finished.record["correction_seconds"]
+    assert 5 < finished.record["seconds"] == 5 + finished.record["correction_seconds"] < 60
     write_map(tmp_path / "map.safetensors", finished)
     stored, points = read_map(tmp_path), torch.rand(100, 3)
     assert torch.equal(stored.field(points)[1], finished.field(points)[1])

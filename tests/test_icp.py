@@ -116,13 +116,15 @@ def test_icp_lands_on_the_true_pose(room: Room) -> None:
 
 def test_icp_says_when_it_is_lost(room: Room) -> None:
     """Catches a crash, or a pose that is no number, where no point has a partner: far from the map,
-    and in its midst, with a hand 30 cm before the camera."""
+    and in its midst, with a hand 30 cm before the camera; and where hardly any is measured."""
     pytest.importorskip("small_gicp")
     frame = room[0][5]
     hand = replace(frame, depth_mm=torch.full_like(frame.depth_mm, 300))
     far, here = torch.eye(4), torch.from_numpy(frame.T_world_camera).float()
     far[:3, 3] = 100.0
-    for seen, T_start in ((frame, far), (hand, here)):
+    blind, few = (replace(frame, depth_mm=0 * frame.depth_mm) for _ in range(2))
+    few.depth_mm[30:33, 40:43] = frame.depth_mm[30:33, 40:43]
+    for seen, T_start in ((frame, far), (hand, here), (blind, here), (few, here)):
         tracker = tracker_in(room)
         tracker.begin(seen, T_start[None])
         tracker.step()

@@ -68,6 +68,7 @@ def test_points_are_fused_at_once() -> None:
     assert (mapped.field.points[:, 2] - 2).abs().max() < 1e-5
     assert mapped.record["mapped_frames"] == 4
     assert mapped.record["misfit_m"] < 0.05
+    assert all(0 < of.record["seconds"] < 60 for of in (mapped, finished_wall()))
 
 
 def map_wall(field_name: str, checkpoint: Path | None, *on_iteration):

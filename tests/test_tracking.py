@@ -88,6 +88,7 @@ def test_where_a_frame_starts() -> None:
     sequence = walk(3)
     tracked = track("sdf", sequence, 0.1)
     assert tracked.frames["steps"].sum() == 0
+    assert tracked.frames["seconds"].between(0, 60).all()
     assert np.allclose(tracked.T_estimated, np.eye(4), atol=1e-7)
     still, errors = (tracked.frames[f"{name}_error_m"] for name in ("still", "translation"))
     np.testing.assert_allclose(still, errors, atol=1e-7)
