@@ -127,9 +127,12 @@ def test_a_cause_is_named() -> None:
 
 
 def test_a_corrected_camera_by_hand() -> None:
-    """Catches a sign, a share of the other side, and an aspect without the common factor."""
+    """Catches a sign, a share of the other side, an aspect without the common factor, and a turn
+    in another unit or before the shift."""
     changed = replace(READING, focal_share=0.1, aspect=0.2, right=0.1, down=-0.1).calibration
     assert astuple(changed) == pytest.approx((64, 48, 52.8, 63.36, 38.4, 19.2))
+    turned = replace(READING, turn_z=90.0, y=0.3).T_world_camera(np.eye(4)[None], "xyzw")
+    np.testing.assert_allclose(turned[0, :2], [[0, -1, 0, 0], [1, 0, 0, 0.3]], atol=1e-12)
 
 
 LIMITS = {

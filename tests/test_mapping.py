@@ -50,6 +50,7 @@ def test_neus_finds_a_wall() -> None:
     mapped = finished_wall()
     ahead = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.7], [0.0, 0.0, 2.0]])
     color, sdf = mapped.field(ahead)
+    assert not sdf.requires_grad
     assert sdf[2].abs() < 0.05
     assert sdf[1] == pytest.approx(0.3, abs=0.1)
     assert (color[2] - 128 / 255).abs().max() < 0.1
