@@ -162,10 +162,7 @@ def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:
 
 def test_no_memory_is_told_in_a_line(box: Path, capsys, monkeypatch) -> None:
     """Catches a traceback, and no word of what would help."""
-
-    def full(*arguments, **options):
-        raise MemoryError
-
+    full = mock.Mock(side_effect=MemoryError)
     monkeypatch.setattr("nbtrack.recordings.reading.np.empty", full)
     assert main(["data", "convert", str(box), str(box.parent / "new")]) == 2
     (line,) = capsys.readouterr().err.splitlines()

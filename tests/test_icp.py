@@ -43,6 +43,7 @@ def room() -> Room:
 
 
 def tracker_in(room: Room, n_pixels: int = 512) -> Tracker:
+    pytest.importorskip("small_gicp")
     settings = IcpSettings(n_pixels=n_pixels)
     return make_tracker("icp", room[1].field, np.eye(4), StepBudget(1), settings)
 
@@ -93,7 +94,6 @@ def test_icp_lands_on_the_true_pose(room: Room) -> None:
     3 degrees off, and elsewhere, in either order; a loss that grows with the number of points,
     a share of other points than were aligned, where many fall into one cell, and a frame that is
     given up for the few points that lie beyond the map."""
-    pytest.importorskip("small_gicp")
     frame, turn, losses = room[0][5], float(np.radians(1)), []
     frame = replace(frame, depth_mm=frame.depth_mm.clone())
     frame.depth_mm[:8, :8] = 60_000
@@ -117,7 +117,6 @@ def test_icp_lands_on_the_true_pose(room: Room) -> None:
 def test_icp_says_when_it_is_lost(room: Room) -> None:
     """Catches a crash, or a pose that is no number, where no point has a partner: far from the map,
     and in its midst, with a hand 30 cm before the camera; and where hardly any is measured."""
-    pytest.importorskip("small_gicp")
     frame = room[0][5]
     hand = replace(frame, depth_mm=torch.full_like(frame.depth_mm, 300))
     far, here = torch.eye(4), torch.from_numpy(frame.T_world_camera).float()
