@@ -184,7 +184,7 @@ def test_a_rejected_step_leaves_the_pose_unchanged() -> None:
             optimizer.step()
             assert (optimizer.damping > damping) == (optimizer.T_world_camera is T)
             assert optimizer.is_ended or optimizer.last_step >= optimizer.problem.stage.min_step
-        assert optimizer.problem.stage.is_fine is is_fine
+        assert optimizer.is_finished is is_fine
         optimizer.refine()
     assert abs(optimizer.T_world_camera - ORIGIN).max() < 2e-3
 

@@ -101,9 +101,10 @@ def test_a_mirrored_path_asks_for_as_much() -> None:
 
 @pytest.mark.parametrize("way", [-1, 1])
 def test_a_turn_asks_for_reach_too(way: int) -> None:
-    """Catches degrees for radians, a turn that needs a motion besides, and turns one way alone."""
-    path = poses_at(np.zeros((11, 3)), np.outer(np.arange(11), [0.0, way * 0.01, 0.0]))
-    for reach_rad, share in ((0.011, 0.0), (0.009, 1.0)):
+    """Catches degrees for radians, a turn that needs a motion besides, turns one way alone, and a
+    turn that counts in other frames: the camera turns in every second one."""
+    path = poses_at(np.zeros((11, 3)), np.outer(np.arange(11) // 2, [0.0, way * 0.01, 0.0]))
+    for reach_rad, share in ((0.011, 0.0), (0.009, 0.5)):
         metrics = reach_metrics(Reach(0.001, reach_rad), path, "previous_pose")
         assert metrics["beyond_reach_share"] == share
         assert metrics["greedy_ate_m"] == pytest.approx(0.0)
