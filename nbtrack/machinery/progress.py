@@ -1,5 +1,6 @@
 """One progress bar: a moving line at a terminal or in a notebook, elsewhere a line now and then."""
 
+import os
 import sys
 import threading
 from collections.abc import Collection
@@ -21,8 +22,12 @@ def tell(news: str) -> None:
     """Print news for the user.
 
     It goes to standard error, since it is no result of a command. In a notebook it goes to standard
-    output, because notebooks show standard error in red.
+    output, because notebooks show standard error in red. At a terminal, texts that begin with
+    `nbtrack: warning: ` are yellow, unless `NO_COLOR` is set.
     """
+    has_colors = sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    if news.startswith("nbtrack: warning: ") and has_colors and not _is_notebook():
+        news = f"\33[33m{news}\33[0m"
     print(news, file=sys.stdout if _is_notebook() else sys.stderr)
 
 
