@@ -278,7 +278,7 @@ def write_table_1(
 def write_table_3(
     folder: Path, results: pd.DataFrame, note: str, wording: Wording = OUR_WORDING
 ) -> list[Path]:
-    """Writes Table III, the methods beyond the paper in mm, as CSV and LaTeX; returns the paths."""
+    """Writes Table III, the methods beyond the paper, as CSV (m) and LaTeX (mm); returns paths."""
     results = naming_points(results)  # results with different n must not be averaged
     cells, styled = average_over_seeds(results), style_table_1(results, unit="mm")
     return _write_table(folder / "table_3", cells, styled, note, wording)

@@ -79,11 +79,15 @@ class RgbdSequence:
 
     @property
     def digest(self) -> str:
-        """A hash of pixels, poses, frame numbers, camera and unit: sixteen hexadecimal digits."""
+        """A hash of all that is mapped, tracked or kept with results: sixteen hexadecimal digits.
+
+        These are images, poses, frame numbers, times, camera and unit. By it a checkpoint that was
+        made with other data is refused.
+        """
         digest = hashlib.blake2b(digest_size=8)
         digest.update(repr((self.intrinsics, self.declared_unit)).encode())
-        for array in (self.frame_ids, self.T_world_camera, self.colors, self.depths_mm):
-            digest.update(np.ascontiguousarray(array).data)
+        for name in ARRAYS:
+            digest.update(np.ascontiguousarray(getattr(self, name)).data)
         return digest.hexdigest()
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":

@@ -272,14 +272,13 @@ def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:
     worst: dict[tuple, tuple[TrackJob, dict[str, float]]] = {}
     for run in runs:
         reach = run.expected_reach()
-        if "greedy_ate_m" not in reach:  # it needs a known true path
+        ate_m, share = (reach.get(name, 0.0) for name in ("greedy_ate_m", "beyond_reach_share"))
+        if ate_m <= _GREEDY_ATE and share <= _SHARE:
             continue
-        key = run.tracker, run.settings, run.steps
-        if key not in worst or reach["greedy_ate_m"] > worst[key][1]["greedy_ate_m"]:
+        key = run.tracker, repr(run.settings), run.steps
+        if key not in worst or ate_m > worst[key][1]["greedy_ate_m"]:
             worst[key] = run, reach
     for run, reach in worst.values():
-        if reach["greedy_ate_m"] <= _GREEDY_ATE and reach["beyond_reach_share"] <= _SHARE:
-            continue
         advice = "take more steps, a lower rate, "
         if run.settings.motion_model == "previous_pose":
             advice += f"--set tracking.{run.tracker}.motion_model=constant_velocity, "

@@ -250,8 +250,9 @@ def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray
     """Make the different texts ticks at 0, 1, 2, ... on x; returns the x of each point.
 
     A point lies near the tick of its text. So that points of different labels stand side by side,
-    each label has its own shift from the tick. With four labels or more the shifts span half of the
-    distance between two ticks; fewer labels stand as close together as four.
+    each label has its own shift from the tick. Neighbouring labels are 0.5 / n apart for n labels,
+    so that all of them stay within half of the distance between two ticks. With fewer than four
+    labels they are as far apart as with four.
     """
     tick_of_point, ticks = pd.factorize(texts)
     axes.set_xticks(range(len(ticks)), ticks)

@@ -191,8 +191,8 @@ def draw_slice(
         draw_levels(axes, places, values, _LINES_M, colors=tones, linewidths=0.4, linestyles="-")
         axes.hlines([], 0, 0, "0.35", linewidth=0.6, label="every 0.25 m")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
-    name, _, unit = field.value_label.partition(" ")  # of "density (1/m)", for "density of 5/m"
-    what = "" if field.is_distance else f": {name} of {level:g}{unit.strip('(1)')}"
+    name, _, unit = field.value_label.removesuffix(")").partition(" (")  # "density", "1/m"
+    what = "" if field.is_distance else f": {name} of {level:g}{unit.removeprefix('1')}"
     axes.hlines([], 0, 0, "black", linewidth=1.4, label=f"surface{what}")
     if seen is not None:
         _draw_veil(axes, xy, seen, **look)

@@ -228,6 +228,8 @@ def declaration(folder: Path, format: str | None = None, depth_scale: float = 0.
     values = read_object(path) if path.is_file() else {}
     try:
         declared_format = with_values(Declaration(), values).format  # raises for a wrong value
+        if declared_format:
+            look_up("format", declared_format, FORMATS)
     except ConfigError as error:
         raise DataError(f"{path}: {error}") from None
     format = format or declared_format or _told_by_files(folder)

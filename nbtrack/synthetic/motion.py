@@ -215,10 +215,15 @@ def _exclusive_cumsum(steps: Values) -> Values:
 
 
 def _tremor(n_frames: int, rng: np.random.Generator) -> PoseParameters:
-    """A hand's tremor, to be added to pose parameters: in each, four sines of 1.5 to 5 Hz."""
-    cycles_per_frame = rng.uniform(1.5, 5.0, (4, 6)) / 30  # frames a second
+    """A hand's tremor, to be added to the six pose parameters.
+
+    In each it is the sum of four sines of 1.5 to 5 Hz with random phases. Together they are as
+    strong as one sine of 0.6 mm in a position, or of 0.5 mrad in an angle.
+    """
+    frame_rate = 30  # Hz
+    cycles_per_frame = rng.uniform(1.5, 5.0, (4, 6)) / frame_rate
     phases = rng.uniform(0, 2 * np.pi, (4, 6))
-    amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / 2.0  # m, rad
+    amplitude = np.array([0.6e-3] * 3 + [0.5e-3] * 3) / np.sqrt(4)  # m, rad; of one of four sines
     waves = np.sin(2 * np.pi * cycles_per_frame * np.arange(n_frames)[:, None, None] + phases)
     return amplitude * waves.sum(axis=1)
 

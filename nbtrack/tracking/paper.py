@@ -79,7 +79,7 @@ class AdamTracker(Tracker):
             if len(T_starts) > 1:
                 self._choose_pixels()
                 losses = torch.stack([self._loss_at(T) for T in T_starts])
-                T_start = T_starts[losses.argmin()]
+                T_start = T_starts[losses.nan_to_num(torch.inf).argmin()]  # NaN is no best start
             self.position.copy_(T_start[:3, 3])
             self.q_wxyz.copy_(geometry.matrix_to_quaternion(T_start[:3, :3]))
             for moments in self.optimizer.state.values():  # Adam's moments and number of steps
