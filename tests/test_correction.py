@@ -161,6 +161,8 @@ def test_a_kidnapped_camera_is_found(found: CorrectedField, sequence: RgbdSequen
         assert estimate.lost is (estimate.report["p_lost"] >= 0.5)
     assert not estimate.lost
     assert estimate.report["p_lost"] < 0.1
+    starts = tracker._starts_by_views(sequence[2], np.eye(4), found.viewpoints)
+    assert len(starts) == 1 + 12 + 20  # the anchor, those of views, and the best random ones
     tracker.restart_anywhere()
     assert tracker.was_lost
 

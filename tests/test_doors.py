@@ -221,6 +221,7 @@ def test_trackers_are_copied_and_fields_are_theirs(copied, name: str) -> None:
     first = tracker(field, name=name)
     assert field.training
     assert all(part.requires_grad for part in field.parameters())
+    assert not any(part.requires_grad for part in first.field.parameters())
     first.track(SEQUENCE[1])
     second = copied(first)
     found = [each.track(SEQUENCE[2]).T_world_camera for each in (first, second)]
