@@ -58,4 +58,5 @@ class SceneBounds:
         device, dtype = origins_world.device, origins_world.dtype
         to_minimum = (constant(self.minimum, device, dtype) - origins_world) / safe
         to_maximum = (constant(self.maximum, device, dtype) - origins_world) / safe
+        # A ray leaves the box where it first passes the farther face of an axis.
         return torch.maximum(to_minimum, to_maximum).amin(dim=-1)

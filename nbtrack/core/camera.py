@@ -26,7 +26,7 @@ class Intrinsics:
     cy: float  # principal point, row; H/2 is the image's middle
 
     def __post_init__(self) -> None:
-        """Makes numbers of numpy Python's. Raises ConfigError for a number that no camera has."""
+        """Makes all numbers Python's own. Raises ConfigError for a number that no camera has."""
         lowest = {"width": 1, "height": 1, "fx": 1e-3, "fy": 1e-3, "cx": -1e7, "cy": -1e7}
         for name, low in lowest.items():
             kind = numbers.Integral if name in ("width", "height") else numbers.Real
@@ -45,8 +45,8 @@ def pixel_directions(
     """Ray directions (camera frame) through pixel centres, with z = 1.
 
     A z-depth times this direction is the observed point. So the directions are no unit vectors: at
-    the corner of a 640x480 image with a 60 degree field of view the length is about 1.23. Pixel
-    indices are integers or real numbers; index 0 is the centre of the first pixel, at 0.5.
+    the corner of a 640x480 image that is 60 degrees wide the length is about 1.23. Pixel indices
+    are integers or real numbers; index 0 is the centre of the first pixel, at 0.5.
     """
     x = (columns.float() + 0.5 - intrinsics.cx) / intrinsics.fx
     y = (rows.float() + 0.5 - intrinsics.cy) / intrinsics.fy

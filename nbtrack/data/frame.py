@@ -40,7 +40,7 @@ class Frame:
     def of_images(cls, camera: Intrinsics, color: np.ndarray, depth: np.ndarray) -> "Frame":
         """A frame of a camera's images. They are copied, so that the caller may reuse their memory.
 
-        Raises DataError for another size or type, or a median depth above 100 m.
+        Raises DataError for another size or type, masked colour, or a median depth above 100 m.
 
         Args:
             color: RGB, (height, width, 3), uint8.
@@ -55,7 +55,7 @@ class Frame:
     @property
     def has_depth(self) -> bool:
         """Whether any pixel has a measured depth."""
-        # torch's `any` of integers takes twenty times as long: 0.3 ms for 640x480 pixels.
+        # For integers torch's `any` takes over ten times as long as `max`.
         return bool(self.depth_mm.max() > 0)
 
     def to(self, device: torch.device) -> "Frame":

@@ -15,7 +15,8 @@ from nbtrack.machinery.inputs import tensor_of
 
 # The neighbours that a pixel's tangent plane is computed from (our choice): how far away they are,
 # as a share of the image's width, and by what share of the pixel's depth they may differ from it.
-# This leaves out pixels at edges, and surfaces seen at more than some 79 degrees from their normal.
+# This leaves out pixels at edges, and surfaces seen at more than some 79 degrees from their normal
+# (if the image is 60 degrees wide).
 PLANE_REACH = 1 / 64
 PLANE_JUMP = 0.1
 
@@ -68,7 +69,8 @@ class PixelSampler:
 
         The tangent plane is computed from the neighbours to the left, right, top and bottom. These
         are some pixels away, so that noise tilts the plane little. The normal is 0 if the pixel or
-        a neighbour has no measured depth, or if a neighbour lies on another surface.
+        a neighbour has no measured depth, or if a neighbour lies outside of the image or on another
+        surface.
         """
         _, height, width = self.depths_mm.shape
         reach = max(1, round(width * PLANE_REACH))  # pixels

@@ -43,7 +43,7 @@ class RgbdSequence:
     declared_unit: float | None = None  # m, see `SceneBounds`
 
     def __post_init__(self) -> None:
-        """Raises DataError for an image or pose array of another type or shape."""
+        """Raises DataError for an array of another type, shape or number of frames."""
         n, size = len(self.colors), (self.intrinsics.height, self.intrinsics.width)
         check_array("colors", self.colors, (n, *size, 3), [UInt8], "uint8")
         check_array("depths_mm", self.depths_mm, (n, *size), [UInt16], "uint16")

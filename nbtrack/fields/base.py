@@ -103,6 +103,7 @@ class Field(nn.Module, abc.ABC):
 
         A field without layers has the width 0, and is computed by a single thread.
         """
+        # A layer's weights have a row for each unit. A scalar, as NeuS's `variance`, is no layer.
         return max((len(weight) for weight in self.parameters() if weight.dim()), default=0)
 
     @property
@@ -239,8 +240,8 @@ def rendered_losses(
 
     Rays without a measured depth count in neither loss. With `over_std` each ray's depth error is
     divided by the standard deviation of its rendered depth, as in iMAP (Sec. 3.3):
-    mean(|D - D_rendered| / sqrt(variance)). No gradient flows through the standard deviation, as in
-    NICE-SLAM, since it would reward blurred surfaces.
+    mean(|D - D_rendered| / sqrt(variance)). This deviation is at least `MIN_STD` (m). No gradient
+    flows through it, as in NICE-SLAM, since it would reward blurred surfaces.
     """
     is_measured = (rays.depth > 0).float()
     depth_error = (seen.depth - rays.depth).abs()

@@ -20,8 +20,8 @@ class IMapField(LearnedField):
     label = "iMAP"
     is_distance = False
     value_label = "density (1/m)"
-    # 1/m. A density has no exact surface; at this one half of the light is absorbed within
-    # ln 2 / 20 = 3.5 cm (our choice).
+    # 1/m. A density has no exact surface. Where it has this value everywhere, half of the light is
+    # absorbed within ln 2 / 20 = 3.5 cm (our choice).
     surface_level = 20.0
 
     def __init__(self, network: NetworkSettings, bounds: SceneBounds, generator: Generator) -> None:

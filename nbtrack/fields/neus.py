@@ -23,7 +23,7 @@ class NeusMapping(base.MappingSettings):
     surface_band: float = 0.15  # m, half width of the region around the measured depth
     lambda_depth: float = 1.0  # per metre
     lambda_eikonal: float = 0.5  # five times that of NeuS: rooms are mostly empty
-    # Share of the samples at which the eikonal loss is computed; it is similar at neighbours.
+    # Share of the samples at which the eikonal loss is computed: neighbours have similar gradients.
     eikonal_share: float = limited(0.25, 0.0, 1.0)
 
 

@@ -60,8 +60,8 @@ def weights_from_sdf(sdf: RaySamples, inverse_std: Scalar) -> Float[Tensor, "ray
     Source: Wang et al. 2021 (NeuS), Eq. 13. NeuS's published code instead extrapolates f from the
     middles of sections; the formula of the paper, used here, needs no second derivatives.
     """
-    # log_ratio is the logarithm of 1 - alpha_i = Phi(f_{i+1}) / Phi(f_i), which is at most 1. The
-    # quotient itself would be 0/0 deep inside objects.
+    # log_ratio is the logarithm of 1 - alpha_i = min(Phi(f_{i+1}) / Phi(f_i), 1). The quotient
+    # itself would be 0/0 deep inside objects.
     log_phi = torch.nn.functional.logsigmoid(inverse_std * sdf)
     log_ratio = log_phi.diff().clamp_max(0)
     # The logarithm of Phi(f_0) times all (1 - alpha_j) before a section. The sum includes the

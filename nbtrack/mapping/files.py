@@ -57,9 +57,9 @@ class Map:
 def write_map(path: Path | str, finished: Map) -> None:
     """Write a map to a file, of about 1 MB for the paper's network.
 
-    If the path is a folder, the file is its `MAP_FILE`. The map's history is then written beside
-    it, and the history and mesh of an earlier map are removed. Weights keep every bit, so that the
-    file gives the same trajectories as the map.
+    If the path is a folder, the file is its `MAP_FILE`. Beside a file of this name the map's
+    history is written, and the history and mesh of an earlier map are removed. Weights keep every
+    bit, so that the file gives the same trajectories as the map.
 
     Nothing is written if `read_map` could not read the file. Then ConfigError is raised for a field
     whose class is not registered, and DataError for a damaged field or record.

@@ -85,7 +85,7 @@ def map_sequence(
 def recipe_of(
     field_name: str, sequence: RgbdSequence, network: Any, settings: Any, seed: int
 ) -> dict[str, Any]:
-    """All that determines a map, as plain values: maps with the same recipe are the same."""
+    """All that determines a map besides the program and the device, as plain values."""
     return {
         "field": field_name,
         "scene": sequence.name,

@@ -34,7 +34,8 @@ def misfit_of(field: Field, frame: Frame) -> float:
 
     It is a median over random measured pixels, at the frame's true pose: of |rendered depth -
     measured depth| for a field that can be rendered; for points and grids, of the absolute distance
-    that the field has at the measured points. It is NaN for a frame without measured depth.
+    that the field has at the measured points. It is NaN for a frame without measured depth. Raises
+    DataError for a frame with depth whose pose is not known.
     """
     if not frame.has_depth:
         return float("nan")
@@ -55,7 +56,7 @@ def misfit_of(field: Field, frame: Frame) -> float:
 
 
 def usual_misfit(field: Field, sequence: RgbdSequence, mapped: Frames) -> float:
-    """A map's usual misfit (m): the median misfit in ten mapped frames, evenly spread.
+    """A map's usual misfit (m): the median misfit in at most ten mapped frames, evenly spread.
 
     It is 0 if none of them has depth. `check_belongs` then allows its minimum, 5 cm.
     """

@@ -45,7 +45,7 @@ def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | i
 
 
 def still_metrics(T_true: Poses) -> dict[str, float]:
-    """The ATE (m) of a camera that stays at the first true pose, and the length (m) of the path.
+    """The ATE (m) of a camera that stays at the first known pose, and the length (m) of the path.
 
     They are called `still_ate_m` and `path_m`, and are missing for fewer than two known poses. A
     tracker is useful only if its ATE is well below `still_ate_m` (see `FOLLOWED_SHARE`).

@@ -52,7 +52,7 @@ class AdamTracker(Tracker):
     """
 
     Settings = AdamSettings
-    # A copy of the current frame. The next frame overwrites its tensors.
+    # Holds a copy of the current frame's images; its name and pose are those of the first frame.
     frame: Frame | None = None
 
     @abc.abstractmethod
@@ -114,7 +114,7 @@ class AdamTracker(Tracker):
         return loss.detach()
 
     def _choose_pixels(self) -> None:
-        """Choose `n_pixels` random pixels among the measured ones.
+        """Choose `n_pixels` random pixels among the measured ones, with replacement.
 
         The number of measured pixels differs from frame to frame, so the choice cannot be recorded.
         """

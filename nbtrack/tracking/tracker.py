@@ -88,9 +88,9 @@ class Tracker(abc.ABC):
 
         Field and budget are copied, so that later changes of the originals have no effect.
 
-        Raises ConfigError for a field in which the tracker does not work, a setting that is not
-        allowed, or an unknown motion model; MissingError for a package that is not installed;
-        DataError for a pose that is not rigid.
+        Raises ConfigError for a field in which the tracker does not work, or for a setting or seed
+        that is not allowed; MissingError for a package that is not installed; DataError for a pose
+        that is not rigid.
         """
         self.check_field(field)
         self.settings = checked(self.Settings() if settings is None else settings, self.Settings)
@@ -228,7 +228,7 @@ class Tracker(abc.ABC):
         synchronize(self.device)
 
     def _search(self, frame: Frame, T_starts: Poses, budget: Budget) -> Estimate:
-        """Search a frame's pose, starting at the best of some poses, until the budget is spent."""
+        """Search a frame's pose from the best of some starts, until converged or out of budget."""
         if not self._is_warm and frame.has_depth:
             self._warm_up(frame, T_starts)
         began = time.perf_counter()

@@ -19,14 +19,14 @@ from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
 from nbtrack.tracking.tracker import Estimate, Tracker
 
-STEPS_TO_FIND = 1000  # steps per frame to find an unknown pose: some dozen descents
+STEPS_TO_FIND = 1000  # steps per frame to find an unknown pose; `LmTracker` takes at most 61
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """The poses of all tracked frames. A first frame whose pose was given is not among them."""
 
-    T_estimated: Poses  # camera to world, OpenCV axes
+    T_estimated: Poses  # camera to world, m, OpenCV axes
     T_true: Poses  # NaN if unknown
     frames: pd.DataFrame  # a row for each frame: id, time, steps, seconds, loss, errors, report
     metrics: dict[str, Any] = field(default_factory=dict)  # of a finished run that was written
@@ -47,8 +47,8 @@ def track_sequence(
     `checkpoint` is written every few seconds; a killed run goes on from it. `on_frame` is told the
     index of each frame and its translation error (m; NaN if the true pose is unknown).
 
-    Raises DataError for fewer than two frames, no measured depth in any frame, or the checkpoint of
-    another run. Source: paper, Sec. I-A and evaluation protocol (no frame is dropped).
+    Raises DataError for fewer than two frames, no depth in any frame, no pose of a known start, or
+    another run's checkpoint. Source: paper, Sec. I-A and evaluation protocol (no frame is dropped).
     """
     _check_trackable(sequence)
     recipe = _recipe(tracker, sequence, is_start_known) if checkpoint else {}
