@@ -106,7 +106,8 @@ def correct_map(finished: Map, sequence: RgbdSequence, voxel: float) -> Map:
     """Correct a map in cells of `voxel` (m) by its mapped frames, as `corrected` does.
 
     `sequence` must be the one that was mapped. The record of the new map has the seconds that the
-    correction took, and the misfit of the corrected map. Raises what `corrected` raises.
+    correction took, which its `seconds` include, and the misfit of the corrected map. Raises what
+    `corrected` raises.
     """
     start = time.perf_counter()
     mapped, _ = split_holdout(len(sequence), finished.record["settings"]["holdout_every"])

@@ -53,9 +53,9 @@ class BakedField(Field):
     def __init__(self, source: Field, voxel: float | int) -> None:
         """Sample a field, on its device, at the vertices of cells of `voxel` (m).
 
-        The grid extends one cell beyond the bounds at each side. With half the voxel the error of
-        interpolation is a quarter, and the memory (20 bytes a vertex) and the time are eight times
-        as much. Raises ConfigError unless the voxel is positive and the grid fits in 0.5 GB.
+        The grid extends at least one cell beyond the bounds at each side. With half the voxel the
+        error of interpolation is a quarter, and the memory (20 bytes a vertex) and the time are
+        eight times as much. Raises ConfigError as `checked_size` does.
         """
         super().__init__(source.bounds)
         self.label = f"{source.label} baked"

@@ -225,7 +225,7 @@ class LmTracker(Tracker):
         anchor = T_expected if self.last_good is None else self.last_good.numpy()
         if self.field.viewpoints is None:
             # The anchor is turned about x, y and z, both ways, by growing angles. The twist of a
-            # turn has the rotation vector (rad) in its first three numbers.
+            # turn has the rotation vector (rad) in its first three numbers. Not all are returned.
             angles = 0.2 * np.arange(1, self.settings.n_restarts)  # rad
             turns = product(angles, np.eye(6)[:3], (1, -1))
             starts = [anchor, *(retract(anchor, way * angle * axis) for angle, axis, way in turns)]

@@ -90,13 +90,14 @@ class LmOptimizer:
     def certainty(self) -> dict[str, float]:
         """Numbers that tell how well the points fit, and how well the cost holds the pose.
 
-        - `inlier_ratio`: the share of points that are inliers in distance and intensity;
+        - `inlier_ratio`: the share of inliers: points that fit in distance and intensity, and whose
+          reliability is not 0;
         - `known_ratio`: the mean reliability of the points;
         - `fitting_ratio`: the share of inliers among points that are weighted by their reliability,
           since points of what was not mapped fit at no pose;
         - `intensity_mad`: the median absolute deviation of the intensity residuals from their
-          median; 0 if intensities have no weight;
-        - `position_std_m`: the position's standard deviation.
+          median (luma); 0 if intensities have no weight;
+        - `position_std_m`: the position's standard deviation (m).
         """
         distance, intensity = self.terms.residuals
         reliability = self.terms.reliability

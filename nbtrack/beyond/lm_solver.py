@@ -179,9 +179,9 @@ def try_step(
     reliabilities with them, although the pose is no worse. In the coarse stage the new
     reliabilities count: far from the pose, a reliable gradient is a sign that a surface is near.
 
-    Returns, in this order, whether the step is taken; the pose, the terms and the twist after it,
-    or those from before if it is not taken; the largest component (rad or m) of the twist that was
-    tried; and the cost before the step.
+    Returns, in this order, whether the step is taken; the pose and the terms after it, and its
+    twist without extrapolation, or those from before if it is not taken; the largest component (rad
+    or m) of the twist that was tried last; and the cost before the step.
     """
     twist = damped_step(problem, T, terms, scales, damping)
     before = robust_cost(terms.residuals, terms.reliability, scales, problem.lambda_intensity)

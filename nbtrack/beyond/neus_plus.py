@@ -27,7 +27,8 @@ _MIN_VOXEL = 0.05  # m; smallest voxel of the grid of observed distances
 _MAX_CELLS_A_SIDE = 128  # of that grid: larger scenes have larger voxels
 _POINTS_PER_FRAME = 10_000  # about, on a regular grid of its pixels
 # m. The tangent plane is the surface nearest to a sample if the distance from it differs by less
-# than this from the distance to the nearest point: by half a voxel of points, and their rounding.
+# than this from the distance to the nearest point. It is a little more than half of the edge
+# (`_MIN_VOXEL` / 2) of the cells in which points are fused.
 _PLANE_TOLERANCE = 0.015
 Flags = Bool[Tensor, "rays samples"]
 
@@ -217,7 +218,7 @@ class FeatureGrid(nn.Module):
         """Activations of the hidden layer at points (m, world frame)."""
         levels = zip(self.volumes, self.voxels, strict=True)
         inputs = [trilinear(volume, self.low, voxel, points_world).T for volume, voxel in levels]
-        # The point itself, about in [-1, 1]: `metres_per_unit` is half the bounds' longest side.
+        # The point itself, about in [-1, 1]: a unit is about half of the bounds' longest side.
         inputs.append((points_world - self.low) / self.metres_per_unit - 1)
         return nn.functional.silu(self.layer(torch.cat(inputs, dim=1)))
 

@@ -56,7 +56,7 @@ def draw_points(
     `edge_jump`; with an infinite `edge_jump` no measured pixel is.
 
     The first pixel is random. At most `_DRAWN_PER_POINT` x `n_points` pixels are looked at, so that
-    fewer points are returned if few pixels are measured.
+    fewer points are returned if few pixels are measured or many are at edges.
     """
     starts = torch.randint(_MODULUS, (2,), generator=generator).numpy()
     depth_mm, color = frame.depth_mm.numpy(), frame.color.numpy()
@@ -99,7 +99,7 @@ def _drawn_points(
         jump = edge_jump * z
         is_smooth = abs(depth_mm[v + 1, u] - z) < jump and abs(depth_mm[v - 1, u] - z) < jump
         is_smooth &= abs(depth_mm[v, u + 1] - z) < jump and abs(depth_mm[v, u - 1] - z) < jump
-        # A pixel without depth is never smooth: its jump is 0, and no difference is below 0.
+        # A pixel without depth is never smooth: no difference is below its jump, which is 0 or NaN.
         if is_smooth:
             depth = z * MILLIMETRE
             points[n_drawn, 0] = (u + 0.5 - cx) / fx * depth
@@ -118,7 +118,7 @@ def _normals(depth_mm: Array, pinhole: tuple, points: Array) -> Array:
 
     A normal is that of the plane through four pixels around the point, at a distance of
     `PLANE_REACH` times the image's width. It is unknown if the depth of one of them differs by more
-    than the share `PLANE_JUMP`. `PixelSampler.normals_camera` computes the same.
+    than the share `PLANE_JUMP`. `PixelSampler.normals_camera` computes the same on flat surfaces.
     """
     height, width = depth_mm.shape
     fx, fy, cx, cy = pinhole

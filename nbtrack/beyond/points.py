@@ -87,7 +87,7 @@ def fuse_points(
     """Average the frames' measured pixels in each voxel to one point of a map.
 
     A point is the mean position (m, world frame) and colour (in [0, 1]) of a voxel's pixels, which
-    reduces noise. Every `stride`-th pixel along both axes is used, if it lies inside the bounds.
+    reduces noise. Every `stride`-th pixel along both axes is used, if its point is in the bounds.
     Voxels with fewer than `min_count` pixels have no point. If all have fewer, those with the most
     have one. Raises ConfigError for a voxel (m) that is far too fine, or longer than the scene.
     """

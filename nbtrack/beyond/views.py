@@ -40,7 +40,8 @@ def view_of(frame: Frame) -> View:
 
     The frame is averaged in cells of the size `_STEP`, and then interpolated along the view's
     directions. Luma is here the mean of red, green and blue, from 1 to 255, and 0 along directions
-    outside of the picture. Depth is in `_DEPTH_UNIT`, and 0 if half of a cell or less was measured.
+    outside of the picture. Depth is in `_DEPTH_UNIT`, at most 12.75 m, and 0 if half of a cell or
+    less was measured.
     """
     camera = frame.camera
     luma, depth_mm = frame.color.float().mean(dim=-1), frame.depth_mm.float()

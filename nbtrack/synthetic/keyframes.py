@@ -56,7 +56,7 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
 def _is_like_the_dataset(room: Room, poses: Poses) -> bool:
     """Whether a path in free space has the right speed, and what it looks at is far enough away.
 
-    In every image at most a quarter of what is seen is nearer than 0.8 m.
+    In every twelfth image, at most a quarter of what is seen is nearer than 0.8 m.
     """
     unit, nearness = _view(room, poses)
     to_mm = np.array([1e3 * unit, 1.0])  # degrees stay degrees

@@ -38,7 +38,8 @@ def room_frames(
 
     `motion` is a name in `MOTIONS`. `seed` determines the camera's path and the depth noise. Every
     frame has its own random numbers, so that the result does not depend on the number of threads.
-    Raises ConfigError for an unknown motion.
+    When the first frame is asked for, it raises ConfigError for an unknown motion, and what the
+    motion raises.
     """
     camera = room_intrinsics(width, height)
     poses = look_up("motion", motion, MOTIONS)(room, n_frames, seed)

@@ -106,7 +106,7 @@ def colorful(
 ) -> Points:
     """Many colors side by side along a world axis, as of books or tins in a shelf.
 
-    A channel differs from that of `base` by up to about `spread`.
+    A channel differs from that of `base` by at most 1.2 times `spread`.
     """
     phase = 2 * np.pi / period * points[:, axis]
     shifts = np.random.default_rng(seed).uniform(0, 2 * np.pi, 3)  # rad
@@ -118,7 +118,10 @@ def colorful(
 
 
 def patchwork(points: Points, base: Color, period: float, seed: int, spread: float = 0.2) -> Points:
-    """Rounded patches in many colors around `base`, as of a quilt, on faces of any direction."""
+    """Rounded patches in many colors around `base`, as of a quilt, on faces of any direction.
+
+    A channel differs from that of `base` by at most 1.5 times `spread`.
+    """
     rng = np.random.default_rng(seed)
     # Rows are world axes; columns are red, green, blue and brightness. All periods differ, so that
     # no two patches near each other look alike.

@@ -24,20 +24,20 @@ PoseParameters = Float[np.ndarray, "n 6"]
 MEAN_STEP = np.array([6.0, 0.65])
 HEIGHTS = (1.1, 1.7)  # m above the floor
 CLEARANCE = 0.35  # m, least distance of the camera to any surface (our choice)
-_KNOT_SPACING = 0.35  # rad turned between two spline knots of a glance around, about 35 frames
+_KNOT_SPACING = 0.35  # rad turned between two spline knots of a glance around, about 33 frames
 _CELL = 0.1  # m, size of a cell in the grid of free space that a tour is planned in
 
 
 def handheld_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
     """Camera-to-world poses (OpenCV axes) of a walk through a room that turns to look around.
 
-    The camera goes along a flat ellipse, 1.6 m long, in the middle of the room's free space, and
+    The camera goes along a flat ellipse, 1.5 m long, in the middle of the room's free space, and
     always looks across the ellipse's center. So it looks ahead from one end, then to the side, and
-    from the other end back to where it came from. It takes about 280 frames for half a circle. A
+    from the other end back to where it came from. It takes about 300 frames for half a circle. A
     seed moves and turns the ellipse a little, so that two seeds give two paths past the same
     things. The ellipse's radius, and the camera's height (1.1 to 1.7 m), direction, tilt and roll
-    wander as cubic splines. The speed varies up to threefold, and a hand's tremor of 1.5 to 5 Hz
-    is added. Mean speeds over the trajectory, or over 120 frames if it is shorter, are `MEAN_STEP`.
+    wander as cubic splines. The turning rate varies about fourfold, and a hand's tremor of 1.5 to
+    5 Hz is added. Mean speeds over the path, or over 120 frames if it is shorter, are `MEAN_STEP`.
 
     Raises `NumericalError` as `attempts` does.
     Source: our choice; the statistics are those of hand-held RGB-D recordings.
@@ -204,7 +204,7 @@ def _wander(
 
 
 def _relative_speed(n_frames: int, rng: np.random.Generator) -> Values:
-    """A smooth random speed for each frame, with a mean of 1; it varies up to about threefold."""
+    """A smooth random speed for each frame, with a mean of 1; it varies about fourfold."""
     speed = np.exp(_wander(n_frames, rng, 0.4, spacing=14, limit=1.6))
     return speed / speed.mean()
 
@@ -231,7 +231,8 @@ def _tremor(n_frames: int, rng: np.random.Generator) -> PoseParameters:
 def camera_poses(parameters: PoseParameters) -> Poses:
     """Camera-to-world poses (OpenCV axes) from x, y, z (m), pitch, yaw and roll (rad).
 
-    A yaw of 0 looks along -z, a positive yaw to the left of that, and a positive pitch up.
+    A yaw of 0 looks along -z, a positive yaw to the left of that, and a positive pitch up. A
+    positive roll lowers the camera's right side.
     """
     pitch, yaw, roll = parameters.T[3:, :, None]
     forward = np.hstack([-np.sin(yaw) * np.cos(pitch), np.sin(pitch), -np.cos(yaw) * np.cos(pitch)])
