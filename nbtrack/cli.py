@@ -30,7 +30,7 @@ def a_path(text: str) -> Path:
 
 
 def a_count(text: str, minimum: int = 1, maximum: int = 2**31 - 1) -> int:
-    """Parse a whole number from `minimum` to `maximum`; the default is the largest seed.
+    """Parse a whole number from `minimum` to `maximum`, by default the largest seed of a room.
 
     Another text raises what argparse reports as a user's error.
     """
@@ -166,9 +166,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _imported(module: str) -> Any:
     """A module with commands. While it is imported, Ctrl-C ends the process at once.
 
-    Nothing is begun then, and libraries that are interrupted go on, or raise other errors.
+    Nothing has begun by then. A library that is interrupted while it is imported may go on, or
+    raise another error.
     """
-    # Only the main thread may set a handler. None is one that is not Python's, and stays.
+    # Only the main thread may set a handler. None stands for a handler that is not Python's, which
+    # could not be restored: it stays.
     is_main = threading.current_thread() is threading.main_thread()
     before = signal.getsignal(signal.SIGINT) if is_main else None
     if before is None:

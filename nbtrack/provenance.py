@@ -35,7 +35,7 @@ def package_code(*folders: str) -> str:
 def code_fingerprint(kind: type) -> str:
     """Twelve hexadecimal digits for the code of a field or tracker class and of this package.
 
-    They change with the files of this package, and with the version of the installed package that
+    They change with the files in `_FOLDERS`, and with the version of the installed package that
     the class is from. For a class from elsewhere, as a user's file, a notebook or an editable
     installation, they change with its qualified name and its attribute `version`, but not with its
     code. Without a `version` the digits differ from process to process, so that no process uses

@@ -55,7 +55,7 @@ def average_over_seeds(results: pd.DataFrame) -> pd.DataFrame:
     Columns are rate_hz (descending), method, scene (those of the dataset as the paper prints them),
     ate_m and, for several seeds, ate_std_m, the sample std (m). A cell with a failed seed is NaN:
     the mean of the others would hide the failure. If the results have a column still_ate_m, it
-    becomes the method `STANDING_STILL`. Raises DataError for two rows of the same cell and seed.
+    becomes the method `STANDING_STILL`. Raises DataError as `_check_keys` does, for cell and seed.
     """
     keys = [*_CELL_1, "seed"] if "seed" in results else _CELL_1
     _check_keys(results, keys)
@@ -131,7 +131,7 @@ def _wide(cells: pd.DataFrame, keys: list[str], value: str) -> pd.DataFrame:
 
 
 def _check_keys(cells: pd.DataFrame, keys: list[str]) -> None:
-    """Raises DataError if a key column is missing, or two rows have the same keys."""
+    """Raises DataError if a key column is missing, or if two rows have the same keys."""
     if not {*keys} <= {*cells}:
         raise DataError(f"a table has the columns {[*cells]}: it needs {', '.join(keys)}")
     if len(twice := cells[cells.duplicated(keys)]):
@@ -209,8 +209,8 @@ def style_table_2(
     styler = _styled(texts, _texts(stds, "{:.1f}"), is_best=False, is_lost=False)
     styler.default_pixels = default_pixels
     is_default = [default_pixels.get(tracker) == n for tracker, n in wide.index]
+    # Braces stand for the label. Notebooks show all labels in bold: the others get normal weight.
     styler.relabel_index(["<b>{} *</b>" if bold else "{}" for bold in is_default], level=1)
-    # Notebooks show every row label in bold, so the others are set to normal weight.
     weights = [_BOLD if default else "font-weight: normal;" for default in is_default]
     styler.apply_index(lambda labels: weights, axis="index", level=1)
     ended = f"; {CONVERGED}: until it converged, with time left" if has_ended.any(axis=None) else ""

@@ -7,6 +7,7 @@ import shlex
 import shutil
 import sys
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -24,6 +25,7 @@ from tiny import tiny_words
 
 from nbtrack import load_preset
 from nbtrack.cli import main
+from nbtrack.experiments.runs import read_trajectory, scores_of
 from nbtrack.experiments.scenes import Scene, open_scene
 from nbtrack.machinery import files
 from nbtrack.machinery.errors import DataError
@@ -161,13 +163,18 @@ def test_an_image_mended_in_place_counts(tmp_path: Path, kind: str) -> None:
 
 
 def test_flagged_and_wrong_frames_are_told_apart(work: Path, capsys) -> None:
-    """Catches "lost frames" that mean errors in one place and the tracker's verdict in another."""
+    """Catches "lost frames" that mean errors in one place and the tracker's verdict in another, and
+    verdicts that do not count where no true pose is known."""
     small = ["--set", "tracking.lm.n_pixels=64", "--set", "tracking.lm.n_restarts=0"]
     assert main([*GIVEN, "map", "--tracker", "lm", *small, "--out", "by_lm"]) == 0
     printed = capsys.readouterr().out
     metrics = json.loads((work / "by_lm/metrics.json").read_text())
     flags = pd.read_csv(work / "by_lm/frames.csv")["lost"]
     assert metrics["flagged_frames"] == flags.sum()
+    run = read_trajectory(work / "by_lm")
+    rows = run.frames.assign(lost=True, translation_error_m=np.nan)
+    without_truth = replace(run, frames=rows, T_true=np.full_like(run.T_true, np.nan))
+    assert scores_of(without_truth)["flagged_frames"] == len(rows)
     for name, says in (("lost", "of the frames, off by"), ("flagged", "of the frames lost, as")):
         assert f"{metrics[f'{name}_frames'] / metrics['frames']:.1%} {says}" in printed
     assert main([*GIVEN, "map"]) == 0

@@ -27,7 +27,7 @@ from nbtrack.synthetic import ROOMS
 from nbtrack.tracking import ClockBudget, StepBudget, Tracker, make_tracker
 from nbtrack.tracking.methods import Methods, find_methods
 
-_FRAMES_A_CELL = 3  # the times that a frame is tracked for a mean number of steps in Table II
+_REPETITIONS = 3  # a cell of Table II is the mean over so many times that a frame is tracked
 # The columns of results that are written with the tables; none depends on the machine's speed.
 _CELL_COLUMNS = (
     "rate_hz", "method", "n_pixels", "scene", "seed", "ate_m", "ate_rmse_aligned_m",
@@ -46,12 +46,12 @@ def tables_command(options: Namespace) -> None:
     preset = load_preset(options.preset, options.config, [*options.settings, *names])
     usual = TABLE_3 if options.beyond else TABLE_1
     methods = find_methods(options.method.split(",") if options.method else usual)
-    # All of the following raise an error for a wrong option, before a room is made.
+    # The following lines check the options, before a room is made.
     execution = Execution(options.workers, options.dask, keep_going=True)
     label = label_of(options.label) if options.label else options.label
     if label != options.label:
         tell(f"nbtrack: LaTeX has no label {options.label!r}: it is {label!r} in the tables")
-    wording = Wording(options.caption, options.label, dict(map(_label_of, preset.scenes.labels)))
+    wording = Wording(options.caption, label, dict(map(_label_of, preset.scenes.labels)))
     prepare(options.out)
     results = _fill_tables(options, preset, methods, execution, wording)
     if failures := [failure for failure in results["failure"] if failure]:
@@ -139,8 +139,8 @@ def measure_steps(preset: Preset, scene: Scene, methods: Methods = TABLE_1) -> p
     scene's map is made if it is not cached.
 
     Returns a row for each cell: tracker ("VR", "SDF", ...), n_pixels, budget_ms, steps and
-    steps_std (mean and standard deviation over repetitions), and converged (whether every search
-    ended before the budget did). Source: paper, Table II and evaluation protocol.
+    steps_std (mean and population std over repetitions), and converged (whether every search ended
+    before the budget did). Source: paper, Table II and evaluation protocol.
     """
     method_of = {}
     for method in find_methods(methods):
@@ -176,7 +176,7 @@ def _steps_within(tracker: Tracker, frame: Frame, budget_ms: float) -> tuple[lis
     """
     tracker.budget = ClockBudget(1000 / budget_ms)  # Hz
     counts, seconds_with_one_more = [], []
-    for _ in range(1 + _FRAMES_A_CELL):
+    for _ in range(1 + _REPETITIONS):
         tracker.restart(frame.T_world_camera)
         estimate = tracker.track(frame)
         counts.append(estimate.steps)
@@ -197,7 +197,7 @@ def default_pixels(preset: Preset, methods: Methods = TABLE_1) -> dict[str, int]
 
 
 def camera_motion(preset: Preset, results: pd.DataFrame) -> str:
-    """A text for captions: how the camera moves in some runs, and how far from frame to frame."""
+    """A text for captions: how the camera moves, and how far a frame (mm), the mean over runs."""
     are_rooms = set(preset.scenes.names) <= set(ROOMS)
     kind = f"{preset.scenes.motion} motion" if are_rooms else "motion of the recordings"
     if "path_m" not in results:
@@ -213,7 +213,10 @@ def _note(preset: Preset, clock: bool) -> str:
 
 
 def described(preset: Preset) -> str:
-    """A text for captions: the preset's name, and the settings that differ from the preset's."""
+    """A text for captions: the preset's name, and the settings that differ from the preset's.
+
+    Settings that the table itself shows are left out.
+    """
     changed = changed_settings(preset.settings, PRESETS[preset.name].settings)
     # The table's columns have the names of scenes, and the rows of Table II the numbers of pixels.
     shown = ("scenes.names", "scenes.labels", "tables.pixels")

@@ -88,8 +88,8 @@ def track_command(options: Namespace) -> None:
     runs.prepare(options.out)
     if not run.needs.given:
         _make_map(run.needs)
-    # A finished run is made again: its files name the recording and the map, which may lie
-    # elsewhere now, and the seconds that it took.
+    # A finished run is made again: its metrics hold the paths of the recording and of the map, and
+    # the seconds that it took. All of them may be others now.
     (run.folder / runs.METRICS_FILE).unlink(missing_ok=True)
     (metrics,) = run_jobs([run])
     draw_overview(run)

@@ -25,7 +25,7 @@ from nbtrack.recordings.pose_files import number_lines, read_tum, shifted
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.tracking import Trajectory
 
-_FRAMES_SHOWN = 20  # an overview shows what every n-th frame saw, n such that 20 or more are used
+_FRAMES_SHOWN = 20  # an overview shows what 20 to 39 evenly spaced frames saw, or all of fewer
 _CELLS = 120  # of an overview's mesh, along two map units
 _MOVIE_FRAMES = 100  # at most so many, evenly spread over a run
 
@@ -96,6 +96,7 @@ def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
     else:
         finished = read_map(source)
     mesh_file = source / MESH_FILE
+    # The file of a map of points has no faces, without which `load_mesh` returns no mesh.
     has_mesh = mesh_file.is_file() and not isinstance(finished.field, PointCloud)
     origin = np.array(finished.record["origin"])
     with naming_damaged(mesh_file, "mesh", "remove it and map again"):

@@ -80,7 +80,7 @@ def track_scenes(
         settings = with_method.tracking_of(tracker)
         n_steps, clock_hz = _budget(method, rate_hz, steps, clock)
         make_budget(n_steps, clock_hz)  # raises for a wrong number, before anything is made
-        map_job = MapJob.of(scene, method.field, with_method, seed=seed)  # makes it an int
+        map_job = MapJob.of(scene, method.field, with_method, seed=seed)  # makes the seed an int
         job = TrackJob(map_job, seen, tracker, settings, n_steps, clock_hz, frames, map_job.seed)
         jobs.append(job)
         row = {"rate_hz": rate_hz, "steps": n_steps, "method": method.label, "scene": scene.name}
@@ -128,6 +128,7 @@ def _row_of(row: dict[str, Any], result: dict[str, Any] | NbtrackError) -> dict[
     """
     if isinstance(result, NbtrackError):
         return {**row, "failure": str(result), "ate_m": float("nan")}
+    # Nested metrics, such as the run's settings, fit into no column.
     metrics = {name: value for name, value in result.items() if not isinstance(value, dict)}
     return {**metrics, **row, "failure": "", "ate_m": metrics.get("ate_rmse_m", float("nan"))}
 
@@ -145,7 +146,7 @@ def _run(jobs: Sequence[TrackJob], execution: Execution | None) -> list[Any]:
 def read_run(name: str | Path) -> Trajectory:
     """Read a finished run, given by its folder or by its name in the column `run` of results.
 
-    Raises MissingError if there is none.
+    Raises MissingError if there is none, and DataError if its files are damaged.
     """
     folder = absolute(name)
     return read_trajectory(folder if folder.is_dir() else runs_folder() / "tracks" / name)

@@ -135,7 +135,7 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
             place = None if any(job.is_timed for job in wave.values()) else workplace
             for folder, outcome in _outcomes(wave, outcomes, show, place):
                 settle(folder, outcome)
-                show({folder: (0.0, "done")})
+                show({folder: (0.0, "done")})  # 0, since `show` counts the work of outcomes
     for job in jobs:
         if job.folder not in outcomes:  # it was done before: its result is only read
             settle(job.folder, _caught(job.result))
@@ -143,11 +143,11 @@ def run_jobs(jobs: Sequence[Job], execution: Execution | None = None) -> list[An
 
 
 def _waves(jobs: Sequence[Job]) -> list[dict[Path, Job]]:
-    """The jobs that are not done, and those that they need, in groups that run one after the other.
+    """The jobs that are not done, with those that they need, in groups that run one after another.
 
-    A group maps folders to jobs, which need only jobs of earlier groups. For tracked runs in
-    corrected maps the groups are plain maps, corrected maps, and runs. Raises ConfigError if no job
-    is given.
+    A group maps folders to jobs, which need only finished jobs and jobs of earlier groups. For
+    tracked runs in corrected maps the groups are plain maps, corrected maps, and runs. Raises
+    ConfigError if no job is given.
     """
     if not jobs:
         raise ConfigError("nothing to do: give at least one scene, field or method, rate and seed")

@@ -84,7 +84,7 @@ class MapJob(Job):
 
     @cached_property
     def key(self) -> str:
-        """A digest of code, device, data, settings and seed.
+        """A digest of code, versions, device, data, settings, frames and seed.
 
         The digest of a given map is of code, device, and the key that is stored with the map.
         """
@@ -146,7 +146,7 @@ class MapJob(Job):
         if self.needs:
             finished = correct_map(self.needs.map(), sequence, self.correction_voxel)
         else:
-            # The key as `code` makes a checkpoint of another key an error.
+            # The key as `code` makes a checkpoint of another key an error, as one copied to here.
             finished = map_sequence(
                 self.field, sequence, self.network, self.settings, self.seed, choose_device(),
                 checkpoint=checkpoint, on_iteration=report_losses, code=self.key,

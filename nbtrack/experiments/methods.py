@@ -6,7 +6,7 @@ from nbtrack.tracking import TRACKERS, tracker_class
 from nbtrack.tracking.methods import METHODS, Method, find_methods
 
 DEFAULT_METHOD = "corrected"
-"""The method of the command line if none is named: the most accurate one, which is also fast."""
+"""The method of the command line if none is named: the most accurate one but for its dense form."""
 TABLE_1 = ("vr", "sdf")
 """The rows of the paper's Table I."""
 TABLE_3 = (

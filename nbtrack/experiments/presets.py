@@ -32,7 +32,7 @@ class ScenesConfig:
     names: tuple[str, ...] = ()  # synthetic rooms, or folders below the data folder
     motion: str = one_of(*MOTIONS)  # of the camera in a synthetic room
     n_frames: int = limited(300, 2, 10_000)  # of a synthetic room
-    width: int = limited(640, 11, 4096)  # of its images, in pixels; the height is three quarters
+    width: int = limited(640, 11, 4096)  # of its images, in pixels; the height: 3/4, rounded down
     track_frames: str = ":"  # the Python slice of frames that are tracked
     seed: int = limited(0, 0, 2**31 - 1)  # of the noise and the motion in a synthetic room
     labels: tuple[str, ...] = ()  # NAME=LABEL: the names of scenes in LaTeX tables
@@ -83,6 +83,7 @@ class Preset:
         """All settings as a tree, for the fields and trackers that are registered now."""
         tree, changes = default_settings(), _CHANGES[self.name]
         of_unnamed = _changes_of_unnamed(changes, tree)
+        # `with_values` is the function of `machinery.settings` here, not the method below.
         return with_values(tree, of_unnamed | changes | self.of_method | self.chosen)
 
     def with_values(self, values: Mapping[str, Any]) -> "Preset":
@@ -177,7 +178,7 @@ def _changes_of_unnamed(changes: dict[str, Any], tree: dict[str, Any]) -> dict[s
     named = {tuple(key.split(".")[:2]) for key in changes}  # as ("mapping", "neus")
     values = {}
     for key, value in changes.items():
-        part, name, *setting = key.split(".")
+        part, name, *setting = key.split(".")  # keys such as scenes.names have no third part
         if name != _MODELS.get(part):
             continue
         for other, settings in tree[part].items():

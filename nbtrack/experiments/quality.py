@@ -83,7 +83,7 @@ def _score_sdf(field: Field, rays: Rays, generator: torch.Generator, room: Room)
     """Mean |error| (m) of the signed distance, near surfaces and in free space that was seen.
 
     It is taken over points on rays of mapped frames. Half of the points lie between the camera and
-    the measured surface, half within `NEAR` of the surface.
+    the measured surface, half within `NEAR` of the surface along the optical axis.
     """
     offsets = torch.rand(len(rays.depth), generator=generator, dtype=torch.float32)
     is_in_front = torch.arange(len(rays.depth)) % 2 == 0
@@ -112,7 +112,7 @@ def _score_surface(
         mesh = extract_mesh(field, sequence, mapped)
     except DataError:
         return {}
-    if isinstance(mesh, trimesh.PointCloud):
+    if isinstance(mesh, trimesh.PointCloud):  # of a map of points, which has no faces
         points = np.random.default_rng(0).permutation(mesh.vertices)[:POINTS_SCORED]
     else:
         points = mesh.sample(POINTS_SCORED, seed=0)

@@ -140,15 +140,15 @@ def read_trajectory(folder: Path) -> Trajectory:
 def scores_of(tracked: Trajectory) -> dict[str, Any]:
     """The errors of a run, its speed, and how well the tracker told which frames were lost.
 
-    What the tracker told is the column `lost`, which not all trackers have. It is compared with the
-    errors in frames with a true pose.
+    What the tracker told is the column `lost`, which not all trackers have. `flagged_frames` counts
+    it in all frames; it is compared with the errors in those with a true pose.
     """
     rows = tracked.frames
     metrics = trajectory_metrics(tracked.T_estimated, tracked.T_true)
     if "lost" in rows:
         rated = rows.dropna(subset="translation_error_m")  # the frames with a true pose
         errors_m = rated["translation_error_m"].to_numpy()
-        metrics["flagged_frames"] = int(rated["lost"].sum())
+        metrics["flagged_frames"] = int(rows["lost"].sum())
         metrics |= score_detection(rated["lost"].to_numpy(dtype=bool), errors_m)
     steps = int(rows["steps"].sum())
     seconds = rows["seconds"]

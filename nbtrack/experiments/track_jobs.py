@@ -64,7 +64,7 @@ class TrackJob(Job):
 
     @cached_property
     def key(self) -> str:
-        """A digest of code, map, tracker, budget, frames and seed.
+        """A digest of code, versions, map, recording, tracker, settings, budget, frames and seed.
 
         By the clock the result also depends on the device and the number of threads.
         """
@@ -159,7 +159,7 @@ class TrackJob(Job):
         if warning == _OTHER_WORLD:  # moves the true poses into the map's world, for the errors
             tracked, is_explained = in_world_of_map(tracked)
             if not is_explained:
-                # The first frame alone may be off, as where the map ends. NaN fits nothing.
+                # If most frames fit, only the first was off, as where the map ends. NaN never fits.
                 fits = tracked.frames["translation_error_m"].median() <= LOST_THRESHOLD_M
                 notes["map_warning"] = None if fits else _UNEXPLAINED
         metrics = scores_of(tracked) | self._provenance(finished) | notes

@@ -109,6 +109,7 @@ def cluster(address: str, n_calls: int) -> Iterator[Workplace]:
         # With `pure` Dask would answer an equal call with the result of an earlier one.
         executor = client.get_executor(pure=False)
         try:
+            # Dask's executor takes all calls, so each beginning gives the same one.
             yield Workplace(lambda: executor, n_calls, 1, [])
         finally:
             executor.shutdown(wait=False)  # after an error: does not wait for jobs that still run
