@@ -49,7 +49,8 @@ def plot_distances(frame: Frame, distances: Curves, title: str = "", end_cm: flo
     """A frame's colour image, and an image of |d| (cm) for each label; unmeasured pixels are grey.
 
     `distances` maps labels to the signed distances d (m) of a map at the frame's measured points,
-    in the order of `frame.measured_pixels()`. Colours end at `end_cm`, else as in `plot_images`.
+    in the order of `frame.measured_pixels()`. Colours end at `end_cm`, or as in `plot_images` if it
+    is 0.
     """
     rows, columns = frame.measured_pixels().cpu().numpy()
     panels = [("observed colour", frame.color.cpu().numpy(), "")]
@@ -63,7 +64,7 @@ def plot_distances(frame: Frame, distances: Curves, title: str = "", end_cm: flo
 
 @style.styled
 def plot_images(rows: list[list[Panel]], title: str = "", ends: Ends | None = None) -> Figure:
-    """Rows of images, each with a title above it; numbers have a colour bar below them.
+    """Rows of equally large images, each with a title; numbers have a colour bar below them.
 
     Images with the same label share one colour bar, whose scale begins at 0. It ends at the label's
     value in `ends`, or by default at a high quantile of all values with the label.
@@ -188,10 +189,11 @@ def plot_panels(
 ) -> Figure:
     """Tables side by side, by their titles: each number is a point on x, in the row of its index.
 
-    Each column is a method with its own colour and mark. All panels have the same rows, from top to
-    bottom: the texts in the tables' indices, each at most once in a table. A pale line connects the
-    points of a row. x is logarithmic and labelled by `x`; with `same_x` it has the same range in
-    all panels. `limits` are up to two values of x by their labels, as vertical lines in each panel.
+    Each of up to five columns is a method with its own colour and mark. All panels have the same
+    rows, from top to bottom: the texts in the tables' indices, each at most once in a table. A pale
+    line connects the points of a row. x is logarithmic and labelled by `x`; with `same_x` it has
+    the same range in all panels. `limits` are up to two values of x by their labels, as vertical
+    lines in each panel.
     """
     texts = pd.Index(np.concatenate([table.index for table in panels.values()])).unique()
     grid = style.new_axes(title, 3.4, 1, len(panels), sharex=same_x, sharey=True)[0]
@@ -216,12 +218,12 @@ def plot_curves(
 ) -> Figure:
     """Column `y` over column `x`: a curve for each group of rows with the same value of `by`.
 
-    If every group has a single row, the rows are points beside their labels. The names of the
-    columns label the axes. If `x` holds texts, these keep the order of their first appearance, and
-    points of different groups stand side by side without lines. A variant of a method, which is
-    named after a comma, is dashed. If the table has columns `from` and `to`, they are drawn as
-    intervals of y. `log` names the logarithmic axes; `line` is matplotlib's style of all lines,
-    where "none" means points only.
+    The names of the columns label the axes. If `x` holds texts, these keep the order of their first
+    appearance, and points of different groups stand side by side without lines. If it holds numbers
+    and every group has a single row, the rows are points beside their labels. A variant of a
+    method, which is named after a comma, is dashed. If the table has columns `from` and `to`, they
+    are drawn as intervals of y. `log` names the logarithmic axes; `line` is matplotlib's style of
+    all lines, where "none" means points only.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
     is_text = not pd.api.types.is_numeric_dtype(table[x])

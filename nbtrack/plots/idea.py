@@ -45,7 +45,7 @@ def plot_idea(
     pixel's ray runs to the right, and `before` limits how much of it (m) is drawn before the
     measured point. For a density it shows iMAP's samples along the ray, the larger the more they
     weigh, and the distance that they render. For a signed distance d it shows the row's measured
-    points, at which d is asked for, and from each a step of length |d| against the gradient.
+    points, at which d is asked for, and from each the step -d along the unit gradient of d.
     """
     points_camera, point_camera = _points_of_row(frame, *pixel)
     distance = point_camera.norm().item()
@@ -75,7 +75,8 @@ def plot_idea(
 def _points_of_row(frame: Frame, row: int, column: int) -> tuple[Tensor, Tensor]:
     """The points (m, camera frame) of a row's measured pixels (n, 3), and of one of them (3,).
 
-    This one is the measured pixel nearest to (row, column); the row is that of this pixel.
+    This one is the measured pixel nearest to (row, column); the row is that of this pixel. The
+    frame must have depth.
     """
     pixels = frame.measured_pixels()
     away = (pixels - pixels.new_tensor([[row], [column]])).abs().sum(dim=0)
@@ -128,7 +129,7 @@ def _draw_samples(axes: Axes, field: LearnedField, T: Pose, point_camera: Tensor
 def _draw_queries(
     axes: Axes, field: LearnedField, T: Pose, points_camera: Tensor, page_camera: Tensor
 ) -> None:
-    """Draw measured points (m), and from each a step of length |d| against the gradient of d.
+    """Draw measured points (m), and from each the step -d along the unit gradient of d.
 
     `T` is camera to world (m); the rows of `page_camera` are the page's axes (camera frame).
     """

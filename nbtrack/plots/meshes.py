@@ -152,7 +152,7 @@ def query_field(field: Field, points_world: GridPoints) -> tuple[np.ndarray, np.
 def seen_by(
     points_world: GridPoints, sequence: RgbdSequence, frames: Frames | None = None
 ) -> Bool[np.ndarray, "*shape"]:
-    """Whether each point (m) was seen: in view of a frame, at most 0.1 m behind what it measured.
+    """Whether each point (m) was seen: in view of a frame, under 0.1 m behind what it measured.
 
     `frames` are indices in the sequence, by default all; every fifth of them is used.
     """

@@ -79,6 +79,7 @@ def plot_pose_losses(
     turned = pose_losses(density, distance, frame, y_deg)
     sdf_cm, vr_cm = turned[[_SDF_LOSS, _VR_LOSS]].idxmin()
     title = f"Turned by {y_deg:g}°, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
+    # Said only if both are lowest away from 0 cm, the true position.
     title += ": a turn is traded for a shift" if sdf_cm and vr_cm else ""
     panels = new_axes(title.replace("-", "−"), 2.9, 1, 2)[0]  # minus signs for hyphens
     tangent_cm = np.array([-5, 0, 5])  # offsets along x of three points on the tangent

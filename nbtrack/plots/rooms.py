@@ -161,10 +161,10 @@ def plot_overview(
 ) -> Figure:
     """Coloured points (m) and camera paths from above, and the errors of a tracked run by frame.
 
-    The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255). Points above all
-    cameras are left out. Walls should look thin and straight: if they are doubled or spread like a
-    fan, the recording is read wrongly. `frames` are the rows of the run whose path is called
-    "tracked". Without them, or without any known true pose, the figure has no errors.
+    The cloud's columns are x, y, z (m, world frame), red, green, blue (0 to 255). `draw_cloud`
+    says which points are left out. Walls should look thin and straight: if they are doubled or
+    spread like a fan, the recording is read wrongly. `frames` are the rows of the run whose path is
+    called "tracked". Without them, or without any known true pose, the figure has no errors.
     """
     has_errors = frames is not None and frames["translation_error_m"].notna().any()
     panels = new_axes(title, 4.2 if has_errors else 6.0, 1, 2 if has_errors else 1)[0]

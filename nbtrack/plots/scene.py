@@ -91,7 +91,7 @@ def draw_mesh(
 
 
 def draw_scale(*panels: Axes) -> None:
-    """Draw a scale bar of 1 m, or another power of ten, below all that is drawn in each panel.
+    """Draw a scale bar below all that is drawn in each panel, as 1 m: a power of ten that fits.
 
     Panels are in metres and have the same limits, so that all bars are at the same height.
     """
@@ -143,8 +143,8 @@ def draw_paths(axes: Axes, T_paths: Paths, to_page: np.ndarray, width: float = 1
 def draw_cloud(axes: Axes, cloud: pd.DataFrame, T_paths: Paths) -> np.ndarray:
     """Draw paths and coloured points from above, without a ceiling that would hide the room.
 
-    Points more than 0.1 m above all cameras are left out. Returns the page's axes, to the right and
-    ahead, in the world frame (2, 3).
+    Points more than 0.1 m above all cameras are left out, and so are the outermost ones (`_CUT`).
+    Returns the page's axes, to the right and ahead, in the world frame (2, 3).
     """
     up, page = draw_from_above(axes, T_paths)
     places = cloud[["x", "y", "z"]]
@@ -191,7 +191,7 @@ def draw_slice(
         draw_levels(axes, places, values, _LINES_M, colors=tones, linewidths=0.4, linestyles="-")
         axes.hlines([], 0, 0, "0.35", linewidth=0.6, label="every 0.25 m")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
-    name, _, unit = field.value_label.removesuffix(")").partition(" (")  # "density", "1/m"
+    name, _, unit = field.value_label.removesuffix(")").partition(" (")  # for "density of 20/m"
     what = "" if field.is_distance else f": {name} of {level:g}{unit.removeprefix('1')}"
     axes.hlines([], 0, 0, "black", linewidth=1.4, label=f"surface{what}")
     if seen is not None:
