@@ -142,7 +142,7 @@ def corrected(field: Field, sequence: RgbdSequence, frames: Frames, voxel: float
     reliability = (depth.mean() / depth) ** 2
     wanted = np.repeat(_OFFSETS, n_points)[:, None] - matrix @ distance_before  # corrections, m
     reliabilities = np.tile(reliability, len(_OFFSETS))
-    # Residuals above 0.01 m, and below above 0.05 in colour, are down-weighted.
+    # Residuals above 0.01 m are down-weighted; and those of colours, in [0, 1], above 0.05.
     distance, diagonal = solve(matrix, wanted, reliabilities, regularisation, 0.01, rounds=4)
     # The share of the Hessian's diagonal that comes from measurements, not from regularisation.
     confidence = (1 - _UNMEASURED) * (1 - regularisation.diagonal() / diagonal)

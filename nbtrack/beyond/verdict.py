@@ -43,7 +43,7 @@ def features(report: Mapping[str, float]) -> Float[np.ndarray, "4"]:
     by the usual one), and of `innovation` (how far, in rad or m, the pose is from the nearest pose
     that the frames before let expect).
     """
-    # Ratios of 0 and 1 would have infinite log odds.
+    # Ratios of 0 and 1 would have infinite log odds. All limits are our choice.
     fitting, known = np.clip([report["fitting_ratio"], report["known_ratio"]], 0.01, 0.99)
     intensity = np.clip(report["intensity_ratio"], 0.5, 10)
     innovation = np.clip(report["innovation"], 0.02, 1)

@@ -56,7 +56,7 @@ def map_sequence(
     `network` is of the field's class `Network` (None: it has none), `settings` of its `Settings`. A
     killed run goes on from the file `checkpoint`, with the batches of an uninterrupted run; the
     caller removes it. `code`, any text, tells versions of the program apart. Raises DataError for
-    frames without depth or pose, or another map's checkpoint; ConfigError; NumericalError.
+    a frame without pose, no depth at all, or another map's checkpoint; ConfigError; NumericalError.
     """
     bounds = observed_bounds(sequence)
     kind = field_class(field_name)

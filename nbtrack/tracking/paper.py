@@ -37,7 +37,8 @@ class AdamSettings(TrackerSettings):
     def reach(self, steps: float, metres_per_unit: float) -> Reach:
         """How far a frame's search can move and turn the camera.
 
-        A turn by a small angle changes the unit quaternion by half of this angle.
+        A turn by a small angle moves the unit quaternion by half of this angle. The reach is that
+        of one component: a turn that moves all four alike may be up to twice as large.
         """
         position = reach(steps, self.position_rate_m(metres_per_unit))
         return Reach(position, 2 * reach(steps, self.orientation_rate))
