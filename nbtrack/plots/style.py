@@ -23,7 +23,7 @@ _LABELS = (  # the labels that have each colour of the palette in all figures
     ("NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map", "greedy"),
     # Rates and sensors have colours that belong to no method of the same figure.
     ("ICP", "at 5 Hz"),
-    ("NeuS+ grid", "at 10 Hz", "bias taken out"),
+    ("NeuS+ grid", "at 10 Hz", "most of the bias taken out"),
     ("five rooms of the paper", "dataset's sensor"),
     ("nine rooms of ours", "at 2 Hz", "unbiased sensor"),
 )
