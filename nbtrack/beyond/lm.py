@@ -1,4 +1,7 @@
-"""The tracker LM: second-order steps on signed distance and intensity, restarts, relocalisation."""
+"""The tracker LM: second-order steps on signed distance and intensity, restarts, relocalisation.
+
+All numbers are our choice.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -44,7 +47,7 @@ _RANDOM = 1000
 
 @dataclass(frozen=True)
 class LmSettings(TrackerSettings):
-    """Settings of the Levenberg-Marquardt tracker. All defaults are our choice."""
+    """Settings of the Levenberg-Marquardt tracker."""
 
     n_pixels: int = 512  # points a frame
     motion_model: str = one_of("better_of_both", "previous_pose", "constant_velocity")
@@ -205,7 +208,7 @@ class LmTracker(Tracker):
         yield cost
 
     def _descend_from(self, T_start: Pose) -> bool:
-        """Run a whole descent from a start. It becomes the best one if its cost is clearly lower.
+        """Run a whole descent from a start. It becomes the best one if its cost is 3 % lower.
 
         Returns whether it confirms the pose of the best descent so far: it ended at the same pose.
         """

@@ -1,4 +1,7 @@
-"""A descent for a frame's pose from one start: steps of Levenberg-Marquardt in two stages."""
+"""A descent for a frame's pose from one start: steps of Levenberg-Marquardt in two stages.
+
+All numbers are our choice.
+"""
 
 import numpy as np
 from jaxtyping import Float

@@ -35,7 +35,10 @@ Flags = Bool[Tensor, "rays samples"]
 
 @dataclass(frozen=True)
 class NeusPlusMapping(NeusMapping):
-    """Settings of mapping with NeuS+: half as many rays as NeuS, and also measured points."""
+    """Settings of mapping with NeuS+: half as many rays as NeuS, and also measured points.
+
+    All are our choice.
+    """
 
     iterations: int = 10_000
     n_rays: int = limited(512, 1, 65536)

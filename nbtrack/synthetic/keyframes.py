@@ -43,7 +43,7 @@ def keyframe_trajectory(room: Room, n_frames: int, seed: int) -> Poses:
 
     for rng in attempts(room, seed):
         moved = keys.copy()  # moved so little that the paths of two seeds pass the same things
-        moved[:, :3] += rng.uniform(-1, 1, (len(keys), 3)) * (0.2, 0.1, 0.2)  # m
+        moved[:, :3] += rng.uniform(-1, 1, (len(keys), 3)) * (0.2, 0.1, 0.2)  # m, our choice
         moved[:, 4] += rng.uniform(-0.12, 0.12, len(keys))  # yaw, rad
         poses = _calibrated_path(room, moved)
         is_far = still_metrics(poses)["still_ate_m"] > least_error_m
@@ -80,6 +80,7 @@ def _calibrated_path(room: Room, keys: Keys) -> Poses:
         if room.sdf(poses[:, :3, 3]).min() > 0:  # rays are cast from free space only
             unit, _ = _view(room, poses)
         wanted = MEAN_STEP * [1e3 * unit, 1.0]  # mm, degrees
+        # At most a factor of two a round (our choice), since a scaled path sees other things.
         move, turn = np.clip(wanted / steps_between(poses).mean(axis=1), 0.5, 2.0)
         middle = keys[:, spread].mean(axis=0)
         keys[:, spread] = middle + (keys[:, spread] - middle) * [move, move, turn]

@@ -5,7 +5,8 @@ reflectance there (RGB in [0, 1]; (n, 3)). `functools.partial` fixes its other a
 wavelengths and sizes are in metres.
 
 Patterns have wavelengths of 0.2 m and more, so that small images do not alias and a small network
-can learn them. No color depends on the viewing direction, since no field of this package does.
+can learn them. No color depends on the viewing direction, since no field of this package does. All
+numbers are our choice.
 """
 
 from collections.abc import Callable
