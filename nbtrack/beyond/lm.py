@@ -91,7 +91,7 @@ class LmTracker(Tracker):
         baked = field if isinstance(field, BakedField) else BakedField(field, self.settings.voxel)
         on_host = baked.cpu()
         self.grid = grid_of(on_host)
-        # A descent on one point compiles all functions, or loads them from the disk, before any
+        # A descent on one point compiles all its functions, or loads them from the disk, before any
         # result depends on them, and inner functions before those that call them. Otherwise the
         # process that compiles them would round sums in another way than later processes.
         any_point = Observed(np.zeros((1, 3)), np.zeros(1), np.empty((0, 3)))

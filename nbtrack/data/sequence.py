@@ -91,7 +91,10 @@ class RgbdSequence:
         return digest.hexdigest()
 
     def select(self, indices: slice | Int[np.ndarray, "n"]) -> "RgbdSequence":
-        """A sequence of some of the frames, in the order given. A slice copies no images."""
+        """A sequence of some of the frames, in the order given. A slice copies no images.
+
+        Raises ConfigError for anything but a slice or a list of indices.
+        """
         if not isinstance(indices, slice) and np.ndim(indices) != 1:
             raise ConfigError(f"`select` takes a slice or a list of frames, not {indices!r:.80}")
         return replace(self, **{name: getattr(self, name)[indices] for name in ARRAYS})

@@ -134,7 +134,10 @@ class _Fit:
         self.field.eval().requires_grad_(False)
 
     def _advance(self, iterations: range) -> None:
-        """Take some steps, then read all their losses together, since reading waits for a GPU."""
+        """Take some steps, then read all their losses together, since reading waits for a GPU.
+
+        Raises NumericalError for a loss that is not finite.
+        """
         start = time.perf_counter()
         pending = []
         for iteration in iterations:
@@ -150,7 +153,10 @@ class _Fit:
         self.seconds += time.perf_counter() - start
 
     def _descend(self) -> torch.Tensor:
-        """Take one step of Adam on a batch; returns the losses before it, ordered as `terms`."""
+        """Take one step of Adam on a batch; returns the losses before it, ordered as `terms`.
+
+        Raises ConfigError if the field's losses are no dictionary or have other names than before.
+        """
         draw = partial(self.sampler.draw, generator=self.generator, frames=self.frames)
         terms = self.field.mapping_losses(draw, self.settings, self.generator)
         found = f"mapping_losses of {self.field.name}"

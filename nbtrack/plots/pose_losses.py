@@ -43,7 +43,7 @@ def pose_losses(
     settings, for the same pixels at all poses and without randomness.
     """
     pixels = frame.measured_pixels()
-    # About 128 pixels give smooth curves, and are fast enough for a slider.
+    # At most 128 pixels, which give smooth curves and are fast enough for a slider.
     rows, columns = pixels[:, :: 1 + pixels.shape[1] // 128]
     directions_camera = pixel_directions(frame.camera, columns, rows)
     color, depth = frame.at(rows, columns)
