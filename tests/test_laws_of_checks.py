@@ -49,14 +49,16 @@ def test_a_value_that_many_pixels_share() -> None:
 
 
 def test_what_images_say() -> None:
-    """Catches frames that count although the camera stands, and means in place of medians."""
+    """Catches frames that count although the camera stands, means in place of medians, and advice
+    to take every frame where some repeat."""
     often, half = np.array([0, 3, 1]), [False, True] * 4
     dark = [0.01] * 5 + [0.9] * 3
     (black,) = findings.of_images(frames(brightness=dark), [], often)
     assert "are black" in black
-    (repeated,) = findings.of_images(frames(is_repeated=half), [], often)
-    assert "50% of the depth images repeat" in repeated
-    assert "::2 of map" in repeated
+    for share, repeats in (("50%", half), ("12%", [False] * 7 + [True])):
+        (repeated,) = findings.of_images(frames(is_repeated=repeats), [], often)
+        assert f"{share} of the depth images repeat" in repeated
+        assert "::2 of map" in repeated
     (shared,) = findings.of_images(frames(), [1], often)
     assert "75% of the depths are 1," in shared
     (none,) = findings.of_images(frames(measured=0.0), [], often)

@@ -42,8 +42,9 @@ class DataReport:
 
     recording: Recording
     frames: pd.DataFrame  # a row for each frame that was read: see `_read`
-    T_world_camera: Poses  # of all frames that have a pose, read as declared
-    # Measured points without outliers: x y z (m, world), red green blue (0 to 255), depth (m).
+    T_world_camera: Poses  # of all frames that have a pose, read as declared, from the origin
+    # Measured points without outliers: x y z (m, world, from the recording's origin), red green
+    # blue (0 to 255), depth (m).
     cloud: pd.DataFrame
     conventions: list[Convention]  # all that were compared, the declared one first
     best: Convention  # the declared one unless another is clearly better
@@ -154,7 +155,7 @@ def quick_look(recording: Recording) -> str:
 
 
 def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
-    """The angle by which the camera turns from each frame to the next."""
+    """The angle (degrees) by which the camera turns from each frame to the next."""
     R = T_world_camera[:, :3, :3]
     cosine = ((R[:-1] * R[1:]).sum(axis=(1, 2)) - 1) / 2  # the sum is the trace of R_a^T R_b
     return np.degrees(np.arccos(cosine.clip(-1, 1)))

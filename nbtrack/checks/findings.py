@@ -39,15 +39,15 @@ def misreading(
 
     `best` is from `fit_all`, `main` from `main_misfits`, and `step_m` from `steps_of`. The first of
     these that holds is said, and the dictionary is empty if none holds:
-    - Coarse steps of depth explain the gaps: a "doubt", or a "note" if the gaps are usual.
     - Another convention than the declared one is the best: a "fault".
+    - Coarse steps of depth explain the gaps: a "doubt", or a "note" if the gaps are usual.
     - A cause explains the gaps: a "note" if usual sensors have such an error, else a "fault".
     - Surfaces lie apart without a known cause: a "doubt", or a "fault" if they lie far apart.
     """
     depth_mm = 1e3 * declared.depth_m
-    usual_mm = declared.usual_apart * depth_mm
-    apart = f"lie {declared.apart * depth_mm:.0f} mm apart" if declared.overlap else "never meet"
-    if best is declared and declared.apart * depth_mm < _OF_STEP * 1e3 * step_m:
+    usual_mm, apart_mm = declared.usual_apart * depth_mm, declared.apart * depth_mm
+    apart = "hardly meet" if np.isnan(apart_mm) else f"lie {apart_mm:.0f} mm apart"
+    if best is declared and apart_mm < _OF_STEP * 1e3 * step_m:
         advice = "use the camera's own depth files, or expect no better poses"
         text = f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
         return {"note" if declared.apart <= declared.usual_apart else "doubt": [text]}
@@ -105,6 +105,7 @@ def no_depth_values(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -
     """
     n_pixels, n_frames = counts
     is_shared = (n_pixels > SHARED * n_pixels.sum()) & (n_frames > _SHARING * len(frames))
+    # A camera that stands still tells nothing, nor do images of only a few different values.
     is_shared &= (np.count_nonzero(n_pixels) > _SPIKE) & (frames.moved_mm.median() > 0)
     most_frequent = np.argsort(-n_pixels)[: _VALUES + 1]
     # Frequencies fall by a factor above _SPIKE after the last value that is no measurement. Among
@@ -132,7 +133,8 @@ def of_images(
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
     if repeated > _MIN_REPEATED:
         found = f"{repeated:.0%} of the depth images repeat the one before, though the poses move"
-        yield f"{found}: leave them out: --frames ::{1 / (1 - repeated):.0f} of map and track"
+        every = max(2, round(1 / (1 - repeated)))  # ::2 leaves out rare repetitions, too
+        yield f"{found}: leave them out: --frames ::{every} of map and track"
     if frames.brightness.median() < _BLACK:
         options = "--set tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
         yield f"the colour images are black: check their folder, or track without colour: {options}"

@@ -20,7 +20,7 @@ from nbtrack.tracking.trajectories import Trajectory
 # real recording) frames of the same room had at most 0.024 m, and of other rooms at least 0.095 m.
 _MISFIT_FACTOR = 3.0  # times the usual misfit of the map's own frames
 _MISFIT_ALLOWED = 0.05  # m
-# `outside_map_share` looks at so many frames of a run, and so many points of a frame, at most. A
+# `outside_map_share` looks at so many frames of a run at most, and about so many points of each. A
 # frame lies outside if a larger share of its points than `_MOSTLY` is outside of the map's bounds.
 _N_FRAMES = 40
 _N_POINTS = 500

@@ -155,7 +155,7 @@ def fit(
     `start` has. Each Gauss-Newton step is tried at several lengths, and the scale of its weights
     follows the gaps.
     """
-    # The unit of a step is what is negligible of each number, so that all are of similar size.
+    # The unit of a number is what is negligible of it, so that all steps are of similar size.
     limit, unit = np.array([(_NUMBERS[key].limit, _NUMBERS[key].negligible) for key in keys]).T
 
     def read(values: np.ndarray) -> Reading:
@@ -202,9 +202,10 @@ def _best_start(values: np.ndarray, limit: np.ndarray, gaps_at: Callable) -> np.
 
 
 def _interval(H: Hessians, g: Gradients) -> Float[np.ndarray, "2 k"]:
-    """Ends of the interval of 95 % around the estimate, by a bootstrap over pairs of frames.
+    """Ends of the interval of 95 %, less the estimate, by a bootstrap over pairs of frames.
 
-    `H` and `g` are the normal equations of each pair at the estimate.
+    Both are in the units of the fit. `H` and `g` are the normal equations of each pair at the
+    estimate.
     """
     # The seed is fixed, so that a recording always has the same interval.
     drawn = np.random.default_rng(0).integers(len(H), size=(_RESAMPLED, len(H)))

@@ -96,7 +96,7 @@ def _export_map(source: Path, format_name: str) -> tuple[bytes, str]:
     else:
         finished = read_map(source)
     mesh_file = source / MESH_FILE
-    # The file of a map of points has no faces, without which `load_mesh` returns no mesh.
+    # The file of a map of points has no faces, and `load_mesh` finds nothing in it.
     has_mesh = mesh_file.is_file() and not isinstance(finished.field, PointCloud)
     origin = np.array(finished.record["origin"])
     with naming_damaged(mesh_file, "mesh", "remove it and map again"):

@@ -25,7 +25,7 @@ import nbtrack
 from nbtrack.machinery.errors import ConfigError, DataError, MissingError, NbtrackError
 from nbtrack.machinery.settings import as_dict
 
-CHECKPOINT_SECONDS = 10.0  # between two checkpoints: what a killed run loses at most
+CHECKPOINT_SECONDS = 10.0  # between two checkpoints: about what a killed run loses
 PACKAGE = Path(nbtrack.__file__).resolve().parent
 # An error of one of these types, raised while a file is read, does not mean that the file is
 # damaged: it is a mistake in the program, a failure of memory or device, or an NbtrackError, whose
@@ -115,7 +115,7 @@ def digest_of(plain: Any, tensors: Mapping[str, torch.Tensor]) -> str:
 
 
 class Checkpoint:
-    """The file from which a killed run goes on; it is written every few seconds.
+    """The file from which a killed run goes on; it is written about every `CHECKPOINT_SECONDS`.
 
     With the path None nothing is written, and every run begins anew.
     """

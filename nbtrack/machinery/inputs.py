@@ -77,7 +77,7 @@ def checked_images(color: Any, depth: Any, size: tuple[int, int]) -> tuple[np.nd
 
     Returns the colour as it is, and the depth in whole millimetres as int32. A depth is 0, which
     means "not measured", where it was 0, negative, not finite, masked, or at least 65535 mm. Raises
-    DataError for another size or type, for masked colour, and for a depth in another unit.
+    DataError for another size or type, for masked colour, and for a median above `_MAX_METRES`.
     """
     check_array("color", color, (*size, 3), [UInt8], "uint8")
     check_array("depth", depth, size, [UInt16, Float], _DEPTH_UNITS)
@@ -151,6 +151,7 @@ def checked_poses(poses: Float[np.ndarray, "_ 4 4"], path: Path) -> Float[np.nda
     if is_known.any():
         center = np.median(T[is_known, :3, 3], axis=0)
         distances = np.linalg.norm(T[:, :3, 3] - center, axis=1)
+        # "lower" takes the distance of one pose, which is never the farthest of several.
         usual = np.quantile(distances[is_known], 0.9, method="lower")
         is_wrong |= is_known & (distances > _ALONE * max(1.0, usual))
     if is_wrong.any():
@@ -204,7 +205,7 @@ def read_lines(path: Path) -> list[str]:
 def read_numbers(path: Path, columns: tuple[int, ...], meaning: str) -> Float[np.ndarray, "n m"]:
     """Read a table of numbers that are separated by blanks or commas.
 
-    NaN, in the spelling of any language, and infinity are kept. Raises DataError for anything else,
+    NaN, as `_NOT_A_NUMBER` spells it, and infinity are kept. Raises DataError for anything else,
     and if the number of columns is not one of `columns`. The message says what a line should hold
     by the words in `meaning`.
     """

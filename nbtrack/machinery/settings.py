@@ -2,8 +2,8 @@
 
 A key is a dotted path such as `mapping.neus.iterations`; an unknown key is an error. Whole numbers
 must lie between 1 and a million, other numbers between 0 and a million, unless the dataclass field
-has limits of its own: useless sizes would overflow, fill the memory or never end. No list may be
-empty.
+has limits of its own: useless sizes would overflow, fill the memory or never end. No list can be
+set to an empty one.
 """
 
 import dataclasses
@@ -137,10 +137,10 @@ def _replaced(node: Any, path: list[str], key: str, value: Any, allowed: Mapping
 def _converted(key: str, old: Any, value: Any, allowed: Mapping) -> Any:
     """The new value of a key, in the type of its old value.
 
-    A single value becomes a tuple of one entry if the old value is a tuple, and a whole number
-    becomes a float if the old value is a float. Nothing else is converted. `allowed` is the
-    metadata of the dataclass field, which may hold "limits" or "choices". Raises ConfigError for
-    another type, and for a value that is not allowed.
+    A list or a single value becomes a tuple if the old value is one, a whole number a float if the
+    old value is one, and a number of numpy one of Python. Nothing else is converted. `allowed` is
+    the metadata of the dataclass field, which may hold "limits" or "choices". Raises ConfigError
+    for another type, and for a value that is not allowed.
     """
     wanted = type(old)
     value = value.item() if isinstance(value, np.generic) else value

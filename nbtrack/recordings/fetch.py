@@ -83,9 +83,9 @@ def _files_of(name: str, archive: zipfile.ZipFile, source: str) -> Files:
 
 
 def _is_missing(file: Path, info: zipfile.ZipInfo) -> bool:
-    """Whether a file is not there, or is cut short, as by a killed download.
+    """Whether a file is not there, or is shorter than the ZIP file's, as by a killed download.
 
-    Raises DataError if the file has other content than the ZIP file's.
+    Raises DataError if the file is not shorter and has other content than the ZIP file's.
     """
     content = file.read_bytes() if file.is_file() else b""
     if (len(content), zlib.crc32(content)) == (info.file_size, info.CRC):

@@ -105,7 +105,8 @@ class Format:
     counts_from_0: bool = False  # the number of an image is the place of its pose in the pose file
     stamps_tell: bool = True  # whether times in a pose file tell the frames; else the order does
     resize_color: bool = False  # colour has another size than depth and shows the same view
-    # Reads a file's poses and their times (s; NaN: none), given the order of its quaternions.
+    # Reads a file's poses and their times (s; NaN: none), given the order of its quaternions. An
+    # error of any type that it or `read_camera` raises for a damaged file becomes a DataError.
     read_poses: Callable[[Path, str], tuple[Poses, Times]] = read_poses
     read_camera: Callable[[Path], Calibration] = read_calibration
     # Reads depth values, `depth_scale` a metre, of a depth map that is no PNG or JPEG, given the
@@ -262,7 +263,7 @@ def _told_by_files(folder: Path) -> str:
 
 
 def holds_recording(folder: Path) -> bool:
-    """Whether a folder has both colour and depth images of a known format."""
+    """Whether a folder has files where a known format has colour, and files where it has depth."""
     return any(_is_there(folder, f.color) and _is_there(folder, f.depth) for f in FORMATS.values())
 
 

@@ -85,9 +85,9 @@ class Images:
     def arrays_of(self, ids: Frames) -> Decoded:
         """Colours and depths of the frames with these numbers (at least one).
 
-        They stay in memory for the next call. If the numbers rise in even steps, as those of a
-        slice do, the returned arrays are views of that memory; if not, they are copies. Raises
-        DataError if a file is damaged, or is of another kind or size.
+        They stay in memory for the next call. If they lie there in even steps, as the frames of a
+        slice usually do, the returned arrays are views of that memory; if not, they are copies.
+        Raises DataError if a file is damaged, or is of another kind or size.
         """
         camera = self.camera_of(ids[0])
         all_ids = np.union1d(self._ids, ids)  # frames that are held, and those asked for

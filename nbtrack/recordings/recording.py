@@ -56,10 +56,10 @@ class Recording:
     def origin(self) -> Position:
         """The point (m, world) that is subtracted from all positions in sequences.
 
-        It is 0 if the cameras are within 1 km of 0. Farther away, as in map coordinates, single
-        precision would lose millimetres, so the origin is the point nearest to the median camera
-        whose coordinates are whole kilometres. Recordings of one place, and the map of the place,
-        then share their origin.
+        It is 0 if no coordinate of the median camera is above 1 km. Farther away, as in map
+        coordinates, single precision would lose millimetres, so the origin is the point nearest to
+        the median camera whose coordinates are whole kilometres. Recordings of one place then
+        mostly share their origin.
         """
         if not self.has_pose.any():
             return np.zeros(3)
@@ -91,7 +91,7 @@ def open_recording(
         check_paired(colors, depths)
         recorded_times = _recorded_times(folder, colors)
     camera, camera_note = _calibration(folder, layout)
-    if camera.depth_scale:
+    if camera.depth_scale:  # it replaces the format's, but not one in `sequence.toml`
         declared = declaration(folder, declared.format, camera.depth_scale)
     moments = Moments(colors, recorded_times, declared.frame_rate, layout.counts_from_0)
     pattern = pose_file or _pose_pattern(folder, layout)

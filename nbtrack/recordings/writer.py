@@ -80,6 +80,7 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
     # The layout's y and z axes point the other way than OpenCV's. Turning them is its own inverse,
     # so the function that reads the layout's poses also writes them.
     T_file = FORMATS["neural_rgbd"].declared.poses_to_opencv(T_world_camera)
+    # The dataset has both files; programs that read it may look for either.
     texts = dict.fromkeys(["poses.txt", "trainval_poses.txt"], number_lines(T_file.reshape(-1, 4)))
     # The camera that a reader of the focal length alone assumes.
     by_focal = Intrinsics.from_focal(camera.width, camera.height, camera.fx)
@@ -94,10 +95,11 @@ def _texts(camera: Intrinsics, T_world_camera: Poses) -> dict[str, str]:
 def convert_sequence(recording: Recording, out: Path, frames: slice = slice(None)) -> str:
     """Write a recording in the Neural RGB-D layout; returns a text that tells the user about it.
 
-    Images stay as they are, except that the distortion of a lens is taken out. Frames without a
-    pose keep their number and get a NaN pose. A camera that the layout cannot describe is written
-    to `intrinsics.txt`. The folder `out` appears when it is complete. Raises DataError if `out`
-    exists, if an image cannot be read, or if no selected frame has a pose.
+    Frames are written as `read_frames` gives them, numbered from 0: depth is z-depth in mm, images
+    have one size, and the distortion of a lens is taken out. Frames without a pose get a NaN pose.
+    A camera that the layout cannot describe is written to `intrinsics.txt`. The folder `out`
+    appears when it is complete. Raises DataError if `out` exists, if an image cannot be read, or if
+    no selected frame has a pose.
     """
     select_frames(recording, frames)  # raises if no frame has a pose
     numbers = select_frames(recording, frames, needs_poses=False)
