@@ -195,7 +195,8 @@ def _drawn_planes(
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """The four arrays of `_measured_planes` from `n_pixels` random pixels, and the points' cells.
 
-    Pixels without a known tangent plane are left out. Raises DataError if none is left.
+    Pixels without a known tangent plane, and points outside of the grid, are left out. Raises
+    DataError if none is left.
     """
     sampler, generator = PixelSampler(sequence, torch.device("cpu")), torch.Generator()
     mapped = torch.from_numpy(frames)

@@ -151,7 +151,7 @@ class ObservedDistance:
         place = distance_transform_edt(point_in < 0, return_distances=False, return_indices=True)
         x, y, z = place[:, ::2, ::2, ::2]
         nearest = points[point_in[x, y, z]]
-        # m, world frame; three indices in the grid, and x, y, z
+        # Positions (m, world frame) of the grid's vertices; the last axis holds x, y and z.
         vertices = np.stack(np.indices(shape)[:, ::2, ::2, ::2], -1) * fine + low + fine / 2
         distance = torch.from_numpy(np.linalg.norm(vertices - nearest, axis=-1)).float()
         vertices_world = torch.from_numpy(vertices.reshape(-1, 3)).float()
@@ -208,6 +208,7 @@ class FeatureGrid(nn.Module):
         extent = high - low
         self.voxels = [settings.finest * 2**level for level in range(settings.levels)]
         shapes = [((extent / voxel).ceil().long() + 1).tolist() for voxel in self.voxels]
+        # All standard deviations of initial weights are our choice. Features begin small.
         options = {"generator": generator, "dtype": torch.float32}
         volumes = [torch.randn(settings.features, *shape, **options) for shape in shapes]
         self.volumes = nn.ParameterList(0.01 * volume for volume in volumes)

@@ -55,7 +55,8 @@ def p_lost(report: Mapping[str, float]) -> float:
     """The probability that the pose of a tracker's report is wrong.
 
     It depends on the `features` and on two other numbers of the report: `position_std_m`, and
-    `last_step`, the length (rad or m) of the last step, which is 0 if the pose has converged.
+    `last_step`, the largest component (rad or m) of the last twist, which is 0 if the pose has
+    converged.
     """
     p_right = 1 / (1 + math.exp(_INTERCEPT + _COEFFICIENTS @ features(report)))
     spread = math.hypot(CORRELATED * report["position_std_m"], report["last_step"])

@@ -23,7 +23,8 @@ class SceneBounds:
     def __post_init__(self) -> None:
         """Makes the corners tuples of Python's floats.
 
-        Raises ConfigError for corners that are not finite or span no box, or a unit <= 0.
+        Raises ConfigError for corners that are not finite or span no box, or a unit that is not
+        positive and finite.
         """
         low, high = tuple(map(float, self.minimum)), tuple(map(float, self.maximum))
         unit = 1.0 if self.declared_unit is None else float(self.declared_unit)

@@ -28,8 +28,8 @@ from nbtrack.machinery.settings import MANY, limited
 MIN_STD = 0.02
 NEAR = 0.05  # m, z-depth of the nearest sample: closer than any depth camera measures
 
-# Samples on each ray of a rendered image, for both passes. They are more than in mapping and lie at
-# fixed places, so that an image does not depend on random numbers.
+# Samples on each ray of a rendered image, for both passes. They are more than in mapping and not
+# random, so that equal calls give equal images.
 _N_STRATIFIED = 48
 _N_IMPORTANCE = 24
 _RAYS_AT_ONCE = 4096  # rays of an image that are rendered together, which bounds memory
@@ -209,7 +209,7 @@ class LearnedField(Field):
 
     @torch.no_grad()
     def render_rays(self, origins_world: Points, directions_world: Points) -> tuple[Colors, Values]:
-        """Colour and z-depth (m) of rays, from two passes with samples at fixed places."""
+        """Colour and z-depth (m) of rays, from two passes whose samples are not random."""
         parts = []
         batches = [each.split(_RAYS_AT_ONCE) for each in (origins_world, directions_world)]
         for origins, directions in zip(*batches, strict=True):

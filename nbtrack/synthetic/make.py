@@ -95,7 +95,8 @@ def room_version(name: str) -> str:
 def room_of(folder: Path) -> Room | None:
     """The exact room that a sequence folder shows; None for a recording of the real world.
 
-    Raises DataError if `room.json` is damaged, or another version of the generator wrote it.
+    Raises DataError if `room.json` is damaged, or another version of the generator wrote it, and
+    ConfigError for an unknown room.
     """
     path = folder / ROOM_FILE
     if not path.is_file():

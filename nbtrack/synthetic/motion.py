@@ -187,7 +187,7 @@ def _closed_walk(room: Room, stops: Float[np.ndarray, "n 2"]) -> Float[np.ndarra
         walk += route[:-1]  # the next route begins with the cell left out here
     rows, columns = np.array(walk).T
     places = np.stack([x[rows], z[columns]], axis=1)
-    return gaussian_filter1d(places, 0.4 / _CELL, axis=0, mode="wrap")  # over 0.4 m
+    return gaussian_filter1d(places, 0.4 / _CELL, axis=0, mode="wrap")  # std: about 0.4 m
 
 
 def _wander(
