@@ -129,6 +129,7 @@ class Parser(argparse.ArgumentParser):
         if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)", message):
             choices = [choice.strip("' ") for choice in wrong[2].split(",")]
             message = f"unknown {wrong[1]!r}: {nearest_name(wrong[1], choices)}"
+            # The value of an option before the command is taken for the command.
             message += "; options follow the command" if self.prog == "nbtrack" else ""
         raise ConfigError(f"{message}; see {self.prog} --help")
 

@@ -177,7 +177,7 @@ def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -
 
     Raises ConfigError for `--map-frames`, for a map of another field, and for a map that was made
     with another value of a setting that the user has chosen. With `--method` it also raises it if
-    only one of the map and the method is corrected.
+    the map is not corrected as the method asks.
     """
     if options.map_frames:
         raise ConfigError("--map-from names a map that is made: leave --map-frames out")
@@ -186,7 +186,7 @@ def _check_fits(given: MapJob, field: str, preset: Preset, options: Namespace) -
         raise ConfigError(f"{found}: leave --method and --field out")
     of_map, wanted = flat(given.setting_tree), flat(preset.settings)
     asked_keys = {*preset.chosen}  # by --set, --config or NBTRACK_SET
-    if options.method:  # its name says whether the map is corrected
+    if options.method:  # it says whether the map is corrected, and in cells of which size
         asked_keys.add(f"correction.{field}")
     for key in sorted(asked_keys & of_map.keys()):  # a map has no settings of a tracker
         if of_map[key] != wanted[key]:

@@ -68,8 +68,8 @@ def _seen(tracked: Trajectory, rows: np.ndarray, recording: Recording) -> RgbdSe
 def _surface(field: Any, seen: RgbdSequence, n_cells: int) -> Any:
     """A mesh of the part of a map that some frames saw.
 
-    Two units of the map, or 6 m if that is more, have `n_cells` cells. Two units are the map's
-    longest side, unless its unit is declared.
+    Two units of the map, or 6 m if that is more, have `n_cells` cells; 6 m have `_CELLS` of 5 cm.
+    Two units are the map's longest side, unless its unit is declared.
     """
     return extract_mesh(field, seen, voxel=max(6.0, 2 * field.bounds.metres_per_unit) / n_cells)
 

@@ -191,4 +191,5 @@ def shares(results: pd.DataFrame, by: list[str], value: str) -> pd.DataFrame:
     middle = (true + z**2 / 2) / (size + z**2)
     half_width = z / (size + z**2) * np.sqrt(true * (size - true) / size + z**2 / 4)
     columns = {value: true / size, "from": middle - half_width, "to": middle + half_width}
+    # Rounding errors alone may lead out of [0, 1].
     return (100 * pd.DataFrame(columns).clip(0, 1)).assign(true=true, size=size).reset_index()

@@ -60,11 +60,11 @@ def nearest(times: Times, others: Times, tolerance: float) -> Frames:
 
 
 def _in_unit_of(times: Times, stamps: Times) -> Times:
-    """Stamps (s) with the unit that brings most of them near some times (s) of the same clock.
+    """Stamps (s), converted to the unit in which many of them are near times (s) of the same clock.
 
     `in_seconds` reads each list by itself, and so may take a fast or sparse count for one of
-    another unit. If no unit brings more than half of the shorter list, and more than one of it,
-    near the other list, the stamps are returned as they are.
+    another unit. A unit fits if more of the times than one, and than half the length of the shorter
+    list, have a stamp near them. If no unit fits, the stamps are returned as they are.
     """
     for scale in (1.0, 1e-3, 1e-6, 1e-9, 1e3, 1e6, 1e9):  # 1 first: most units are right
         n_near = (nearest(times, scale * stamps, _TOLERANCE) >= 0).sum()
@@ -135,7 +135,7 @@ class Moments:
     def numbers(self) -> Frames | None:
         """The frames' numbers, from the names of their images.
 
-        None unless exactly one number in the names varies: then it is not clear which is meant.
+        None unless `frame_keys` has one number for each image: else it is not clear which is meant.
         """
         keys = frame_keys(self.images)
         return np.array(keys).ravel() if set(map(len, keys)) == {1} else None
