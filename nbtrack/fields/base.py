@@ -238,10 +238,11 @@ def rendered_losses(
 ) -> Losses:
     """Weighted L1 losses of the depth (m) and colour that rays see, for mapping and tracking.
 
-    Rays without a measured depth count in neither loss. With `over_std` each ray's depth error is
-    divided by the standard deviation of its rendered depth, as in iMAP (Sec. 3.3):
-    mean(|D - D_rendered| / sqrt(variance)). This deviation is at least `MIN_STD` (m). No gradient
-    flows through it, as in NICE-SLAM, since it would reward blurred surfaces.
+    Rays without a measured depth count in neither loss, so that both are of the same pixels. With
+    `over_std` each ray's depth error is divided by the standard deviation of its rendered depth, as
+    in iMAP (Sec. 3.3): mean(|D - D_rendered| / sqrt(variance)). This deviation is at least
+    `MIN_STD` (m). No gradient flows through it, as in NICE-SLAM, since it would reward blurred
+    surfaces.
     """
     is_measured = (rays.depth > 0).float()
     depth_error = (seen.depth - rays.depth).abs()
