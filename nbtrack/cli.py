@@ -34,7 +34,7 @@ def a_count(text: str, minimum: int = 1, maximum: int = 2**31 - 1) -> int:
 
     Another text raises what argparse reports as a user's error.
     """
-    if not (text.lstrip("-").isdecimal() and minimum <= int(text) <= maximum):
+    if not (re.fullmatch(r"-?\d{1,18}", text) and minimum <= int(text) <= maximum):
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number from {minimum} to {maximum}")
     return int(text)
 

@@ -291,9 +291,9 @@ def test_a_unit_of_depth_in_a_camera_file(plain: Path, scale: dict[str, float]) 
     """Catches a unit that is ignored, or that is stronger than the declaration; what is not used of
     the file is named."""
     before = read_sequence(plain).depths_mm
-    recordings.change_camera(plain, **scale, serial="17")
+    recordings.change_camera(plain, **scale, serial="17", parts=[[1], [1, 2]])
     np.testing.assert_allclose(read_sequence(plain).depths_mm, before / 4, atol=1)
-    assert "not used of intrinsics.json: serial" in open_recording(plain).notes
+    assert "not used of intrinsics.json: parts, serial" in open_recording(plain).notes
     (plain / "sequence.toml").write_text("depth_scale = 2000")
     np.testing.assert_allclose(read_sequence(plain).depths_mm, before / 2, atol=1)
 

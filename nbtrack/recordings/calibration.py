@@ -136,7 +136,7 @@ def _from_json(path: Path) -> Calibration:
     entries = {_OTHER_NAMES.get(key, key): value for key, value in camera.items()}
     unused = tuple(sorted(entries.keys() - _COUNTS.keys()))
     with naming_damaged(path, "description of a camera", _ADVICE):
-        for key in unused:
+        for key in filter(_TELLING.match, unused):
             _check_unused(key, entries[key])
         numbers = {key: _numbers(key, entries[key]) for key in entries.keys() & _COUNTS.keys()}
         # Entries that are one number: all but a matrix and a list of distortion.
@@ -173,11 +173,11 @@ def _numbers(key: str, value: Any) -> list[float]:
 
 
 def _check_unused(key: str, value: Any) -> None:
-    """Raises ValueError if an entry that is not read tells of another lens or unit.
+    """Raises ValueError if an entry that is not read, but `_TELLING`, is of another lens or unit.
 
-    Only entries whose names match `_TELLING` are checked. A word in `_USUAL`, zeros, false, null or
-    an empty list as their value stands for the usual lens and unit.
+    A word in `_USUAL`, zeros, false, null or an empty list as its value stands for the usual lens
+    and unit.
     """
     is_usual = value.lower() in _USUAL if isinstance(value, str) else not np.any(value)
-    if _TELLING.match(key) and not is_usual:
+    if not is_usual:
         raise ValueError(f"{key} is {str(value)[:40]!r}, which is not used")
