@@ -66,7 +66,7 @@ class MapJob(Job):
         finished = _stored(path)
         name, record = finished.field.name, finished.record
         network, settings = record["network"], record["settings"]
-        voxel = record.get("correction", 0.0)
+        voxel = record.get("correction", 0.0)  # m; `correct_map` records it
         return cls(None, name, network, settings, correction_voxel=voxel, given=path)
 
     @property
@@ -156,7 +156,6 @@ class MapJob(Job):
             "up": up_of(sequence.T_world_camera).tolist(),
             "frames": self.frames,
             "key": self.key,
-            "correction": self.correction_voxel,
             "versions": provenance.versions(),
         }
         finished = replace(finished, record=finished.record | record)
