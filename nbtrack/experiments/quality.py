@@ -106,7 +106,7 @@ def _score_surface(
 
     Points of the true surface are those where `rays` of mapped frames meet the room, at most one in
     each cell of 5 cm. So surfaces near the camera, where rays are dense, count no more than far
-    ones. Empty if the map has no surface.
+    ones. Empty if the map has no surface where frames looked.
     """
     try:
         mesh = extract_mesh(field, sequence, mapped)

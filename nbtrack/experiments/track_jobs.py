@@ -208,6 +208,7 @@ class TrackJob(Job):
             if warning == _OTHER_WORLD:  # only the estimated poses are in the map's world
                 followed = replace(followed, T_world_camera=T_estimated)
             notes["outside_map_share"] = outside_map_share(finished.field, followed, T_estimated)
+        # With as many steps as a frame had in the mean: a search may end early, or by the clock.
         reach = self.settings.reach(tracked.frames["steps"].mean(), unit_m)
         reached = reach_metrics(reach, T_true, self.settings.motion_model)
         return notes | still_metrics(T_true) | reached
