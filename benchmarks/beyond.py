@@ -1,6 +1,6 @@
 """The larger results that notebook 6 reads: CSV files in paper_tables/beyond.
 
-    python benchmarks/beyond.py [convergence|units]
+    python benchmarks/beyond.py [convergence|map_and_start|units]
 
 They are of the two rooms of the preset `smoke`, with the paper's numbers of steps, and take an hour
 on one CPU core. Maps and runs are kept with all others (`NBTRACK_RUNS`), so that a killed run
@@ -17,7 +17,7 @@ import pandas as pd
 import torch
 from motions import HAND_HELD
 
-from nbtrack import METHODS, Method, load_preset, make_tracker, open_scenes, track_scenes
+from nbtrack import Method, load_preset, make_tracker, open_scenes, track_scenes
 from nbtrack.experiments.bench import described
 from nbtrack.experiments.grid import Execution
 from nbtrack.experiments.methods import RATES_3_HZ, TABLE_1, TABLE_3
@@ -35,20 +35,6 @@ from nbtrack.tracking.metrics import trajectory_metrics
 _COLUMNS = ["rate_hz", "method", "n_pixels", "scene", "frames"]
 _COLUMNS += ["steps_per_frame", "seconds_per_frame", "still_ate_m", "ate_m"]
 
-_CHANGES = {
-    "without colour": "tracking.lm.lambda_intensity=0",
-    "from the previous pose": "tracking.lm.motion_model=previous_pose",
-    "from constant velocity": "tracking.lm.motion_model=constant_velocity",
-    "with four times the points": "tracking.lm.n_pixels=2048",
-    "in NeuS+ without rendering": "mapping.neus_plus.lambda_rendering=0",
-}
-# LM in NeuS+, and the same with one change at a time.
-INGREDIENTS = [
-    METHODS["baked"],
-    *(Method(label, "neus_plus", "lm", (setting,)) for label, setting in _CHANGES.items()),
-    Method("in NeuS, as in the paper", "neus", "lm"),
-]
-
 
 def write(name: str, table: pd.DataFrame) -> None:
     """Write a table to a CSV in paper_tables/beyond."""
@@ -56,7 +42,7 @@ def write(name: str, table: pd.DataFrame) -> None:
 
 
 def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
-    """Table III, the time a frame, how fast maps get right, and what each ingredient of LM adds."""
+    """Table III, the time a frame, how fast maps get right, and both trackers in the same maps."""
     results = track_scenes(scenes, TABLE_3, preset, RATES_3_HZ, frames=":")
     write("table_3_cells", results[_COLUMNS])
     device = device_name(choose_device())
@@ -66,23 +52,19 @@ def beyond(scenes: Sequence[Scene], preset: Preset) -> None:
     # the runs above is taken from the cache.
     speed = track_scenes(scenes, TABLE_3, preset, [10], frames="0:", execution=Execution(workers=1))
     write("speed", speed[_COLUMNS])
-    write("convergence", convergence(scenes[0], preset))
-    parts = [
-        track_scenes(scenes[:1], INGREDIENTS, preset, steps=30, frames=frames).assign(kept=frames)
-        for frames in (":", "::8")
-    ]
-    kept = ["method", "scene", "kept", "steps_per_frame", "still_ate_m", "ate_m"]
-    write("ingredients", pd.concat(parts)[kept])
+    write("convergence", convergence(scenes, preset))
+    write("map_and_start", map_and_start(scenes, preset))
 
 
-def convergence(scene: Scene, preset: Preset) -> pd.DataFrame:
-    """Time and accuracy of maps by field and number of iterations, with three seeds.
+def convergence(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
+    """Time and accuracy of maps of a scene by field and number of iterations, with three seeds.
 
     `seconds` are those of a core. `near_m` and `free_m` are errors of the distance near surfaces
     and in free space. `lm_m` is the ATE of LM with 2,048 points in the sampled map, without
     correction, at every fourth frame.
     """
-    sequence, tracked, rows = scene.read(), scene.read("::4"), []
+    scene, rows = scenes[0], []
+    sequence, tracked = scene.read(), scene.read("::4")
     fields = "neus", "neus_plus", "grid_plus"
     torch.set_num_threads(1)
     for seed, name, iterations in product(range(3), fields, (30, 60, 125, 250, 500, 1000)):
@@ -102,6 +84,18 @@ def convergence(scene: Scene, preset: Preset) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=columns)
 
 
+def map_and_start(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
+    """SDF and LM at 10 Hz in the same maps and from the same starts."""
+    runs, keys = [], ["map", "tracker", "start"]
+    starts = "previous_pose", "constant_velocity"
+    for field, tracker, start in product(("neus", "neus_plus"), ("sdf", "lm"), starts):
+        setting = f"tracking.{tracker}.motion_model={start}"
+        method = Method(f"{tracker} in {field}, {start}", field, tracker, (setting,))
+        trials = track_scenes(scenes, [method], preset, [10], frames=":")
+        runs.append(trials.assign(map=field, tracker=tracker, start=start))
+    return pd.concat(runs)[[*keys, "scene", "frames", "steps_per_frame", "still_ate_m", "ate_m"]]
+
+
 def units(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
     """VR and SDF at 10 Hz with learning rates in metres, and in units of the map: longer steps."""
     runs = []
@@ -113,12 +107,13 @@ def units(scenes: Sequence[Scene], preset: Preset) -> pd.DataFrame:
     return pd.concat(runs)[["position_unit", *kept, "reach_m", "greedy_ate_m"]]
 
 
+PARTS = {"convergence": convergence, "map_and_start": map_and_start, "units": units}
+
+
 if __name__ == "__main__":
     smoke = load_preset("smoke", settings=HAND_HELD)
     rooms = open_scenes(smoke)
-    if sys.argv[1:] == ["convergence"]:
-        write("convergence", convergence(rooms[0], smoke))
-    elif sys.argv[1:] == ["units"]:
-        write("units", units(rooms, smoke))
-    else:
+    for part in sys.argv[1:]:
+        write(part, PARTS[part](rooms, smoke))
+    if not sys.argv[1:]:
         beyond(rooms, smoke)
