@@ -92,7 +92,7 @@ FIGURES = {
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
     "samples": lambda s: plot_idea(IMAP_FIELD, s[0], {"": s.T_world_camera[0]}, (6, 8), "many"),
-    "both losses": lambda s: plot_pose_losses(IMAP_FIELD, NEAR, s[0], 8.0, 4.0),
+    "both losses": lambda s: plot_pose_losses(IMAP_FIELD, NEAR, s[0], 4.0),
     "no density": lambda s: plot_density(pose_losses(IMAP_FIELD, NEAR, s[0]), "elsewhere"),
     "steps": lambda s: plots.plot_steps({"SDF": steps_of(s)}, s[0], s.T_world_camera[5], 0.02),
     "queries": lambda s: plot_idea(
@@ -282,7 +282,7 @@ def test_a_method_keeps_its_color() -> None:
 
 def test_errors_are_those_of_their_frames() -> None:
     """Catches errors over the number of a row, and metres for centimetres."""
-    line, _, still, _ = FIGURES["errors"](None).axes[0].lines
+    line, _, still = FIGURES["errors"](None).axes[0].lines
     assert line.get_xdata() == pytest.approx([33, 36])
     assert line.get_ydata() == pytest.approx([1.0, 30.0])
     assert still.get_label() == "standing still"

@@ -15,7 +15,6 @@ from nbtrack.data.frame import MILLIMETRE, Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.plots import style
 from nbtrack.tables import STANDING_STILL
-from nbtrack.tracking.metrics import LOST_THRESHOLD_M
 
 DEPTH, DISTANCE = "depth (m)", "|signed distance| (cm)"
 # With `panchor` a colour bar does not change its panels' anchor: else panels with a bar would stand
@@ -152,15 +151,13 @@ def plot_columns(tables: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
 def plot_errors(frames: Mapping[str, pd.DataFrame], title: str = "") -> Figure:
     """Errors of every frame: position (cm, logarithmic) and orientation (degrees).
 
-    `frames` maps methods to the rows of their runs' frames.csv, all of the same frames. The dashed
-    line is the ATE of 0.2 m above which the paper prints a sequence in red; the dotted one is the
-    error of a camera that stands still.
+    `frames` maps methods to the rows of their runs' frames.csv, all of the same frames. The dotted
+    line is the error of a camera that stands still.
     """
     above, below = style.new_axes(title, 4.9, 2, sharex=True)[:, 0]
     draw_errors(above, frames)
     for label, color in style.method_colors(frames).items():
         below.plot(frames[label]["frame_id"], frames[label]["rotation_error_deg"], color=color)
-    above.axhline(100 * LOST_THRESHOLD_M, label="0.2 m (paper's limit for ATE)", **style.DASHED)
     below.set(ylabel="rotation error (degrees)", xlabel="frame")
     return above.figure.legend_below()
 

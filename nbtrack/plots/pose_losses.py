@@ -66,32 +66,22 @@ def pose_losses(
 
 @styled
 def plot_pose_losses(
-    density: LearnedField, distance: Field, frame: Frame, x_cm: float = 0.0, y_deg: float = 0.0
+    density: LearnedField, distance: Field, frame: Frame, y_deg: float = 0.0
 ) -> Figure:
     """Both losses of `pose_losses` along x.
 
-    Each loss has two curves: with the camera turned by `y_deg`, and a pale one without a turn. A
-    dot marks the pose that is moved by `x_cm` and turned, with the gradient as a line through it.
-    For sliders:
-    `interact(plot_pose_losses, density=fixed(...), ..., x_cm=(-20, 20), y_deg=(-10, 10))`.
+    Each loss has two curves: with the camera turned by `y_deg`, and a pale one without a turn. For
+    a slider: `interact(plot_pose_losses, density=fixed(...), ..., y_deg=(-10, 10))`.
     """
     straight = pose_losses(density, distance, frame)
     turned = pose_losses(density, distance, frame, y_deg)
     sdf_cm, vr_cm = turned[[_SDF_LOSS, _VR_LOSS]].idxmin()
     title = f"Turned by {y_deg:g}°, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
-    # Said only if both are lowest away from 0 cm, the true position.
-    title += ": a turn is traded for a shift" if sdf_cm and vr_cm else ""
     panels = new_axes(title.replace("-", "−"), 2.9, 1, 2)[0]  # minus signs for hyphens
-    tangent_cm = np.array([-5, 0, 5])  # offsets along x of three points on the tangent
     for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
         axes.plot(straight[name], color=color, alpha=0.4, label="pale: not turned")
         axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
         axes.plot(turned[name].idxmin(), turned[name].min(), "v", color="0.3", label="lowest")
-        loss = np.interp(x_cm, turned.index, turned[name])
-        gradient = np.interp(x_cm, turned.index, np.gradient(turned[name], turned.index))
-        # Only the middle one of the three points, the pose itself, has a dot.
-        look = {"marker": "o", "markevery": [1], "label": "this pose, its gradient"}
-        axes.plot(x_cm + tangent_cm, loss + gradient * tangent_cm, color="0.3", **look)
         axes.axvline(0, label="the true pose", **DASHED)
         axes.set(xlabel="camera off along x (cm)", ylabel=name)
     return panels[0].figure.legend_below()

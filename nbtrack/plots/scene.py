@@ -192,8 +192,8 @@ def draw_slice(
         axes.hlines([], 0, 0, "0.35", linewidth=0.6, label="every 0.25 m")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
     name, _, unit = field.value_label.removesuffix(")").partition(" (")  # for "density of 20/m"
-    what = "" if field.is_distance else f": {name} of {level:g}{unit.removeprefix('1')}"
-    axes.hlines([], 0, 0, "black", linewidth=1.4, label=f"surface{what}")
+    what = "surface" if field.is_distance else f"{name} of {level:g}{unit.removeprefix('1')}"
+    axes.hlines([], 0, 0, "black", linewidth=1.4, label=what)
     if seen is not None:
         _draw_veil(axes, xy, seen, **look)
     return image.norm

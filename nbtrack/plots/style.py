@@ -16,16 +16,17 @@ from matplotlib.ticker import LogLocator, NullLocator
 from PIL import Image
 
 PALETTE = "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d4d4d", "#a6911a"
-_LABELS = (  # the labels that have each colour of the palette in all figures
-    ("iMAP with VR", "iMAP", "VR"),
+# The labels that have each colour of the palette in all figures. Rates and sensors have colours
+# that belong to no method of the same figure.
+_LABELS = (
+    ("iMAP with VR", "iMAP", "VR", "at 2 Hz"),
     ("NeuS with SDF", "NeuS", "SDF", "NeuS+ with SDF (Adam)"),
     ("NeuS+ baked (LM)", "NeuS+", "LM"),
     ("NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map", "greedy"),
-    # Rates and sensors have colours that belong to no method of the same figure.
     ("ICP", "at 5 Hz"),
     ("NeuS+ grid", "at 10 Hz", "most of the bias taken out"),
     ("five rooms of the paper", "dataset's sensor"),
-    ("nine rooms of ours", "at 2 Hz", "unbiased sensor"),
+    ("nine rooms of ours", "unbiased sensor"),
 )
 _FIXED = {label: color for color, labels in zip(PALETTE, _LABELS, strict=True) for label in labels}
 # Green and red as in the paper's first figure, in tones that colour-blind readers can tell apart
