@@ -189,7 +189,7 @@ def _read(
     table has a row for each of `ids`:
 
     - `measured`: the share of pixels with depth; `brightness`: the mean colour, in [0, 1];
-    - `depth_step`: the greatest common divisor of all depth values;
+    - `depth_step`: the greatest common divisor of the frame's depth values;
     - `is_repeated`: whether the depth image is that of the row before;
     - `moved_mm`, `turned_deg`: how far the camera moved and turned since the recording's frame
       before, and `off_mm`, how far it is off the middle between the frames before and after; NaN if

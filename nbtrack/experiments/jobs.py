@@ -253,6 +253,7 @@ def _outcome_there(settings: Mapping, search_path: list[str], n_threads: int, wo
 
     def report(share: float, status: str) -> None:
         nonlocal last_written
+        # At share 0 the job begins, or waits for another process: this is always told.
         if share == 0 or time.monotonic() - last_written >= _LOOK_SECONDS:
             write_atomic(_progress_file(job), json.dumps([share, status]))
             last_written = time.monotonic()
