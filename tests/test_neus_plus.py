@@ -55,24 +55,24 @@ def test_plane_distance_of_a_slanted_wall() -> None:
 
 def test_targets_by_hand() -> None:
     """Catches swapped signs, a plane that is believed where something else is nearer or no normal
-    is known, targets far behind the surface, and rays without a depth that teach anything.
+    is known, targets far behind the surface, none at it, and rays without depth that teach.
 
-    The ray measured 2 m at a plane met head-on; samples at 1, 1.9, 2.05 and 2.3 m.
+    The ray measured 2 m at a plane met head-on; samples at 1, 1.9, 2, 2.05 and 2.3 m.
     """
     zeros, ahead = torch.zeros(3, 3), torch.tensor([[0.0, 0.0, 1.0]] * 3)
     normals = -ahead * torch.tensor([[1], [0], [0]])
     rays = Rays(zeros, ahead, zeros, torch.tensor([2.0, 0.0, 2.0]), normals)
-    depths = torch.tensor([1.0, 1.9, 2.05, 2.3]).expand(3, 4)
-    nearest = torch.tensor([[0.4, 0.11, 0.06, 0.3]] * 2 + [[0.01] * 4])
-    nowhere = torch.zeros(3, 4, dtype=torch.bool)
+    depths = torch.tensor([1.0, 1.9, 2.0, 2.05, 2.3]).expand(3, 5)
+    nearest = torch.tensor([[0.4, 0.11, 0.01, 0.06, 0.3]] * 2 + [[0.01] * 5])
+    nowhere = torch.zeros(3, 5, dtype=torch.bool)
     target, known = distance_targets(rays, depths, nearest, nowhere, CONFIG)
     # At 1 m a chair is nearer (0.4 m) than the wall (1 m).
-    torch.testing.assert_close(target[0, :3], torch.tensor([0.4, 0.1, -0.05]))
-    assert known[0].tolist() == [1.0, 1.0, 1.0, 0.0]
-    assert known[1].sum() == known[2, 2] == 0
-    # A thin plate: a camera has seen the third sample's place to be free.
+    torch.testing.assert_close(target[0, :4], torch.tensor([0.4, 0.1, 0.0, -0.05]))
+    assert known[0].tolist() == [1.0, 1.0, 1.0, 1.0, 0.0]
+    assert known[1].sum() == known[2, 3] == 0
+    # A thin plate: a camera has seen the fourth sample's place to be free.
     target, known = distance_targets(rays, depths, nearest, depths == 2.05, CONFIG)
-    assert known[0].tolist() == [1.0, 1.0, 0.0, 0.0]
+    assert known[0].tolist() == [1.0, 1.0, 1.0, 0.0, 0.0]
 
 
 def test_observed_distance_from_a_wall() -> None:
