@@ -75,7 +75,7 @@ def rewrite_poses(folder: Path, poses: np.ndarray) -> None:
 def test_axes_of_either_hand_come_back() -> None:
     """Catches poses that stay mirrored, or are none, where camera and world are left-handed."""
     poses = walk(3)
-    for axes, way in product(AXES, ("camera-to-world", INVERSE)):
+    for axes, way in product(AXES, ("camera-to-world", WORLD_TO_CAMERA)):
         written = np.stack([as_written(T, axes, way) for T in poses])
         found = Declaration(camera_axes=axes, poses=way).poses_to_opencv(written)
         np.testing.assert_allclose(found, poses, atol=1e-12)
@@ -230,13 +230,12 @@ def mixed(data):
     return data._replace(poses=wrong)
 
 
-INVERSE = "world-to-camera"
 MISTAKES = [
     *(
         Case(
             re.escape(axes_name(axes, way)) + "(, or the images.*)?; set ", change=poses(axes, way)
         )
-        for way in ("camera-to-world", INVERSE)
+        for way in ("camera-to-world", WORLD_TO_CAMERA)
         for axes in (*AXES[:4], *AXES[4::22])
         if (axes, way) != ("opencv", "camera-to-world")
     ),
@@ -247,8 +246,7 @@ MISTAKES = [
     Case("5000 depth values a metre; set depth_scale = 5000 in", change=depth(lambda d: 5 * d)),
     # By three bits to the left, as SUN3D stores them: up to 8.19 m times 8.
     Case("8000 depth values a metre; set", change=depth(lambda d: (d << 3) | (d >> 13))),
-    Case("1000 depth values", "depth_scale = 1"),
-    Case("1000 depth", "depth_scale = 5000000"),
+    *(Case("1000 depth values", f"depth_scale = {n}") for n in (1, 5000000)),
     Case('distances along the ray, not z-depth; set depth_along = "ray" in', change=along_rays),
     Case('depth along the optical axis; set depth_along = "axis" in', 'depth_along = "ray"'),
     Case("one with its principal point in the middle of the image; set", change=camera(1.0, 0.02)),
@@ -262,13 +260,16 @@ MISTAKES = [
     Case("ones whose y is mirrored; mul", change=positions(lambda t: t * [1, -1, 1])),
     Case("ones whose z is .* and -1 ", change=positions(lambda t: t * [1, 1, -1])),
     Case(".* whose rotations alone are of the other direction; transp", change=mixed),
+    *(
+        Case(f"{n} depth values a metre; set", change=depth(lambda d, n=n: n / 1000 * d))
+        for n in (100, 256, 4000, 6553.5, 10000)
+    ),
 ]
 RIGHT = [
     Case("", f'camera_axes = "{axes}"\nposes = "{direction}"', poses(axes, direction))
     for axes in ("opencv", "opengl", "forward left up")
-    for direction in ("camera-to-world", INVERSE)
+    for direction in ("camera-to-world", WORLD_TO_CAMERA)
 ]
-RIGHT += [Case("", "depth_scale = 5000", depth(lambda d: 5 * d))]
 
 
 def write(folder: Path, name: str, case: Case) -> Path:
