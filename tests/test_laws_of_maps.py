@@ -81,18 +81,23 @@ def test_near_measurements_count_more(monkeypatch) -> None:
 
 
 def test_before_and_behind_a_wall_alike(monkeypatch) -> None:
-    """Catches offsets of equations that lie more on one side of a surface: a wall halfway between
-    vertices, of a map that has 0.6 of the distance, is corrected in mirror images."""
+    """Catches offsets of equations that lie more on one side of a surface, and points that weigh
+    too much or little: a wall through vertices, of a map that has 0.6 of the distance, is corrected
+    in mirror images. At the wall, the measured part of the Hessian's diagonal is that by hand."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 20_000)
     depths_mm = np.full((1, 48, 64), 2000.0)
     frames = sequence_of(depths_mm, Intrinsics.from_focal(64, 48, 48.0))
     flat = Formula(lambda points: 0.6 * (2.0 - points[:, 2]), BOX)
     field = corrected(flat, frames, np.arange(1), 0.1)
-    across = torch.tensor([[0.1, 0.05, 2.0 + s] for s in (-0.13, -0.08, -0.03, 0.03, 0.08, 0.13)])
+    across = torch.tensor([[0.1, 0.05, 2 + s] for s in (-0.13, -0.08, -0.03, 0, 0.03, 0.08, 0.13)])
     *_, distance, confidence = field.channels(across)
     torch.testing.assert_close(distance, -distance.flip(0), rtol=0, atol=1e-4)
     torch.testing.assert_close(confidence, confidence.flip(0), rtol=0, atol=2e-3)
-    torch.testing.assert_close(distance[2:4], torch.tensor([0.03, -0.03]), rtol=0, atol=1e-3)
+    torch.testing.assert_close(distance[2:5], torch.tensor([0.03, 0, -0.03]), rtol=0, atol=1e-3)
+    # 20,000 points on 3072 pixels are 37.5 in a cell of 0.1 m at 2 m. Averaged over the cells
+    # around a vertex, the squared weights of the five offsets sum up to 3.425 * (2 / 3) ** 2.
+    measured = 37.5 * 3.425 * (2 / 3) ** 2  # and 0.7 from regularisation
+    assert confidence[3] == pytest.approx(0.1 + 0.9 * measured / (measured + 0.7), abs=3e-3)
 
 
 @pytest.mark.parametrize("factor", [1.0, 3.0])
