@@ -41,8 +41,7 @@ def test_the_first_step_of_adam_by_hand(unit: str) -> None:
     rate_m = 5e-4 * (room.bounds.metres_per_unit if unit == "map" else 1.0)
     np.testing.assert_allclose(found[:3, 3], [rate_m, -rate_m, rate_m], rtol=1e-3)
     quaternion = Rotation.from_matrix(found[:3, :3]).as_quat(scalar_first=True)
-    vector = np.abs(quaternion[1:] / quaternion[0])
-    np.testing.assert_allclose(vector, 1e-3, rtol=2e-3)
+    np.testing.assert_allclose(np.abs(quaternion[1:] / quaternion[0]), 1e-3, rtol=2e-3)
     assert tracker.q_wxyz.norm().item() == pytest.approx(1, abs=3e-7)
     starts = torch.from_numpy(poses_at([[0.1, 0.0, 0.0], [0.05, -0.04, 0.03]]))
     for T_starts in (starts, starts.flip(0)):  # the better one is taken up

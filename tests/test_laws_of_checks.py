@@ -52,8 +52,7 @@ def test_what_images_say() -> None:
     """Catches frames that count although the camera stands, means in place of medians, and advice
     to take every frame where some repeat."""
     often, half = np.array([0, 3, 1]), [False, True] * 4
-    dark = [0.01] * 5 + [0.9] * 3
-    (black,) = findings.of_images(frames(brightness=dark), [], often)
+    (black,) = findings.of_images(frames(brightness=[0.01] * 5 + [0.9] * 3), [], often)
     assert "are black" in black
     for share, repeats in (("50%", half), ("12%", [False] * 7 + [True])):
         (repeated,) = findings.of_images(frames(is_repeated=repeats), [], often)
@@ -261,8 +260,7 @@ def test_a_leaning_wall_that_is_seen_twice() -> None:
 )  # fmt: skip
 def test_how_far_apart_a_wall_lies_by_hand(place_m, changes, residual_m, depth_m) -> None:
     """Catches a sign, an inverted pose, another unit or weight, and points beside the image."""
-    reading = replace(READING, **changes)
-    found = wall_from(place_m).compare(reading)
+    found = wall_from(place_m).compare(replace(READING, **changes))
     gap = residual_m / depth_m
     gaps = found.area_gaps[np.isfinite(found.area_gaps)]
     np.testing.assert_allclose(gaps, gap, atol=1e-4)

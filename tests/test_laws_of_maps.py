@@ -85,8 +85,7 @@ def test_before_and_behind_a_wall_alike(monkeypatch) -> None:
     too much or little: a wall through vertices, of a map that has 0.6 of the distance, is corrected
     in mirror images. At the wall, the measured part of the Hessian's diagonal is that by hand."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 20_000)
-    depths_mm = np.full((1, 48, 64), 2000.0)
-    frames = sequence_of(depths_mm, Intrinsics.from_focal(64, 48, 48.0))
+    frames = sequence_of(np.full((1, 48, 64), 2000.0), Intrinsics.from_focal(64, 48, 48.0))
     flat = Formula(lambda points: 0.6 * (2.0 - points[:, 2]), BOX)
     field = corrected(flat, frames, np.arange(1), 0.1)
     across = torch.tensor([[0.1, 0.05, 2 + s] for s in (-0.13, -0.08, -0.03, 0, 0.03, 0.08, 0.13)])
@@ -180,8 +179,7 @@ def test_how_far_points_lie_behind_what_was_seen() -> None:
 def test_how_far_a_map_is_off_by_hand() -> None:
     """Catches a pose that is inverted, a sign that counts, and frames that were not mapped: walls
     lie where the frames saw them, or 10 cm before or behind that."""
-    poses = poses_at([[0.1, 0.05, -0.1]] * 3, [0.1, -0.3, 0.2])
-    sequence = box_sequence(poses)
+    sequence = box_sequence(poses_at([[0.1, 0.05, -0.1]] * 3, [0.1, -0.3, 0.2]))
     assert misfit_of(BoxRoom(), sequence[0]) < 0.03  # rendered: as sharp as its samples
     for off in (-0.1, 0.1):
         grid = BakedField(BoxRoom(half=(1.0 + off, 0.8 + off, 1.2 + off)), 0.05)

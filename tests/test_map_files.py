@@ -87,8 +87,7 @@ MAP_CONTENT = {
     "weights of NaN": (WEIGHT, lambda w: w * np.nan, "is not finite"),
     "no digest": ("digest", GONE, CHANGED),
 }
-HEADERS = pd.read_csv(Path(__file__).parent / "data/map_files.csv", index_col="case")
-for row in HEADERS.itertuples():
+for row in pd.read_csv(Path(__file__).parent / "data/map_files.csv", index_col="case").itertuples():
     MAP_CONTENT[row.Index] = (row.place, json.loads(row.value), row.says)
 
 

@@ -79,8 +79,7 @@ def test_observed_distance_from_a_wall() -> None:
     """Catches wrong voxel centres, axes or units: the wall z = 2 + x is 1 / sqrt(2) m away from
     (0, 0, 1)."""
     bounds = SceneBounds((-1.5, -1.5, -0.1), (3.0, 1.5, 5.0))
-    frames = np.arange(4)
-    observed = ObservedDistance(slanted_wall(4), frames, bounds, torch.device("cpu"))
+    observed = ObservedDistance(slanted_wall(4), np.arange(4), bounds, torch.device("cpu"))
     points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.6], [0.0, 0.0, 3.0]])
     found, is_free = observed(points[None])
     expected = torch.tensor([[0.707, 0.0, 0.99, 0.707]])

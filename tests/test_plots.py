@@ -127,8 +127,7 @@ def test_every_axis_has_a_unit_and_nothing_leaks(name: str, sequence) -> None:
 def test_curves_of_methods_and_sweeps() -> None:
     """Catches a group without its own line, colour or mark, text sorted by letters, and spans drawn
     elsewhere."""
-    table = SWEEP.assign(**{"from": 0.5, "to": 4.0})
-    axes = plots.plot_curves(table, *SWEEP).axes[0]
+    axes = plots.plot_curves(SWEEP.assign(**{"from": 0.5, "to": 4.0}), *SWEEP).axes[0]
     looks = [(line.get_label(), line.get_color(), line.get_marker()) for line in axes.lines]
     assert looks == [("VR", PALETTE[0], "o"), ("SDF", PALETTE[1], "s")]
     assert axes.collections[0].get_segments()[0][:, 1].tolist() == [0.5, 4.0]

@@ -109,8 +109,7 @@ def test_guided_depths(generator: torch.Generator) -> None:
     assert all((part.floor() == k).any(dim=-1).all() for k in range(8))
     assert (depths > rays.depth[:, None]).sum(dim=-1).float().mean() > 4.5  # four of them behind it
     # One stratified sample falls into each of 16 parts, so none is left unseen.
-    gaps = depths.diff(dim=-1).amax(dim=-1)
-    assert (gaps <= 2 * (rays.depth + 0.15) / 16).all()
+    assert (depths.diff(dim=-1).amax(dim=-1) <= 2 * (rays.depth + 0.15) / 16).all()
     blind = rays_ahead(40, torch.zeros(40))
     last = guided_depths(blind, BOX, CONFIG, generator).amax(dim=-1)
     assert 2.7 < last.min() <= last.max() <= 3.15 + 1e-5

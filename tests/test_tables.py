@@ -19,7 +19,6 @@ PAPER_SOURCE = PROJECT / ".." / "shared" / "reference" / "paper.tex"
 
 PUBLISHED_1, PUBLISHED_2 = tables.published_table_1(), tables.published_table_2()
 COLUMNS_1 = ["rate_hz", "method", "scene", "ate_m"]
-COLUMNS_2 = ["tracker", "n_pixels", "budget_ms", "steps"]
 OURS_1 = pd.DataFrame(
     [
         (5, "A", "room_b", 0.10), (5, "B", "room_b", 0.20), (5, "C", "room_b", 0.05),
@@ -28,7 +27,7 @@ OURS_1 = pd.DataFrame(
 )  # fmt: skip
 OURS_2 = pd.DataFrame(
     [("LM", 64, 100, 3.04), ("LM", 64, 50, 1.0), ("VR", 512, 50, 2.0), ("VR", 16, 50, 4.0)],
-    columns=COLUMNS_2,
+    columns=["tracker", "n_pixels", "budget_ms", "steps"],
 )
 SEEDS = pd.DataFrame(
     [(10, m, "x", v, s) for s, v in enumerate((0.1, 0.2, 0.3)) for m, v in (("A", v), ("B", 1.0))],
