@@ -125,12 +125,16 @@ def test_every_axis_has_a_unit_and_nothing_leaks(name: str, sequence) -> None:
 
 
 def test_curves_of_methods_and_sweeps() -> None:
-    """Catches a group without its own line, colour or mark, text sorted by letters, and spans drawn
-    elsewhere."""
+    """Catches a group without its own line, colour or mark, a variant that looks like another
+    method or like its own, text sorted by letters, and spans drawn elsewhere."""
     axes = plots.plot_curves(SWEEP.assign(**{"from": 0.5, "to": 4.0}), *SWEEP).axes[0]
     looks = [(line.get_label(), line.get_color(), line.get_marker()) for line in axes.lines]
     assert looks == [("VR", PALETTE[0], "o"), ("SDF", PALETTE[1], "s")]
     assert axes.collections[0].get_segments()[0][:, 1].tolist() == [0.5, 4.0]
+    variant = SWEEP.replace({"VR": "SDF, far"})
+    lines = plots.plot_curves(variant, *SWEEP).axes[0].lines
+    looks = [(line.get_color(), line.get_marker(), line.get_linestyle()) for line in lines]
+    assert looks == [(PALETTE[1], "o", "--"), (PALETTE[1], "o", "-")]
     words = SWEEP.replace({"time (ms)": {1.0: "b", 9.0: "a"}})
     axes = plots.plot_curves(words, *SWEEP, log="y").axes[0]
     assert [label.get_text() for label in axes.get_xticklabels()] == ["b", "a"]

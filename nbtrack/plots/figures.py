@@ -1,7 +1,7 @@
 """Figures of images, measured and rendered, and figures of numbers as curves and points."""
 
 from collections.abc import Mapping
-from itertools import chain, cycle
+from itertools import chain
 
 import matplotlib
 import numpy as np
@@ -218,18 +218,21 @@ def plot_curves(
     The names of the columns label the axes. If `x` holds texts, these keep the order of their first
     appearance, and points of different groups stand side by side without lines. If it holds numbers
     and every group has a single row, the rows are points beside their labels. A variant of a
-    method, which is named after a comma, is dashed. If the table has columns `from` and `to`, they
-    are drawn as intervals of y. `log` names the logarithmic axes; `line` is matplotlib's style of
-    all lines, where "none" means points only.
+    method, which is named after a comma, has the method's mark and is dashed. If the table has
+    columns `from` and `to`, they are drawn as intervals of y. `log` names the logarithmic axes;
+    `line` is matplotlib's style of all lines, where "none" means points only.
     """
     axes = style.new_axes(title, 3.6)[0, 0]
     is_text = not pd.api.types.is_numeric_dtype(table[x])
     places = _side_by_side(axes, table[x], table[by]) if is_text else table[x]
     colors = style.method_colors(table[by])
     groups = table.assign(**{x: places}).groupby(by, sort=False)
-    for (label, rows), mark in zip(groups, cycle(_MARKS), strict=False):
-        dash = "--" if ", " in label and line == "-" else line
-        look = {"linestyle": "none" if is_text else dash, "color": colors[label], "label": label}
+    line = "none" if is_text else line
+    mark_of: dict[str, str] = {}
+    for label, rows in groups:
+        method, is_variant, _ = label.partition(", ") if line == "-" else (label, "", "")
+        mark = mark_of.setdefault(method, _MARKS[len(mark_of) % len(_MARKS)])
+        look = {"linestyle": "--" if is_variant else line, "color": colors[label], "label": label}
         axes.plot(rows[x], rows[y], mark, **look)
         if "from" in table:
             axes.vlines(rows[x], rows["from"], rows["to"], colors[label], linewidth=0.8)
@@ -241,7 +244,7 @@ def plot_curves(
             point = rows[x].item(), rows[y].item()
             axes.annotate(label, point, (6, -3), textcoords="offset points", color=colors[label])
     else:
-        axes.figure.legend(loc="outside right center")
+        axes.figure.legend(loc="outside right center", handlelength=3)
     return axes.figure
 
 

@@ -21,7 +21,7 @@ PALETTE = "#3b6fb6", "#e08214", "#7b3294", "#17a2a2", "#8c510a", "#c51b7d", "#4d
 _LABELS = (
     ("iMAP with VR", "iMAP", "VR", "at 2 Hz"),
     ("NeuS with SDF", "NeuS", "SDF", "NeuS+ with SDF (Adam)"),
-    ("NeuS+ baked (LM)", "NeuS+", "LM"),
+    ("NeuS+ baked (LM)", "NeuS+ (LM)", "NeuS+", "LM"),
     ("NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map", "greedy"),
     ("ICP", "at 5 Hz"),
     ("NeuS+ grid", "at 10 Hz", "most of the bias taken out"),
