@@ -156,8 +156,7 @@ def test_times_of_images_settle_it(tmp_path: Path) -> None:
     (tmp_path / "r/timestamps.txt").write_text(matrix_text(np.arange(4)[:, None] / 30))
     np.testing.assert_allclose(open_recording(tmp_path / "r").T_world_camera, source().poses[:4])
     times = listed(tmp_path / "own", "from 1").times
-    lines = tum_lines(times[1:], source().poses[1:])
-    (tmp_path / "own/trajectory.txt").write_text(lines)
+    (tmp_path / "own/trajectory.txt").write_text(tum_lines(times[1:], source().poses[1:]))
     own = open_recording(tmp_path / "own")
     assert np.flatnonzero(~own.has_pose).tolist() == [0]
     np.testing.assert_allclose(own.T_world_camera[1:], source().poses[1:])
