@@ -122,6 +122,8 @@ def test_poses_that_cannot_be_compared() -> None:
         says = f"{len(pair[0])} estimates, {len(pair[1])} true poses: "
         with pytest.raises(DataError, match=says):
             pose_errors(*pair)
+    with pytest.raises(DataError, match="1 estimates, 6 true poses"):
+        trajectory_metrics(poses[:1], poses)
 
 
 def test_detection_of_lost_frames() -> None:

@@ -23,8 +23,11 @@ def trajectory_metrics(T_estimated: Poses, T_true: Poses) -> dict[str, float | i
 
     Frames whose true pose is unknown (NaN) are left out. If all are unknown, only the numbers of
     frames are returned. `ate_rmse_m` is the error of the paper's evaluation protocol. The other
-    errors distinguish a map that is offset from a tracker that drifts (our choice).
+    errors distinguish a map that is offset from a tracker that drifts (our choice). Raises
+    DataError as `pose_errors` does.
     """
+    if len(T_estimated) != len(T_true):
+        raise DataError(f"{len(T_estimated)} estimates, {len(T_true)} true poses: pair them")
     is_known = np.isfinite(T_true).all(axis=(1, 2))
     counts = {"frames": len(T_true), "frames_without_reference": int((~is_known).sum())}
     if not is_known.any():
