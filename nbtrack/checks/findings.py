@@ -24,11 +24,12 @@ _MAX_STEP = 0.01  # share of the depth: coarser steps of a camera's depth are re
 # Coarse steps of depth explain a gap below this share of a step. In right recordings with such
 # steps surfaces lie 0.13 to 0.19 of a step apart.
 _OF_STEP = 0.2
-# A depth value is no measurement if three shares are large: more than SHARED of all depths have the
+# A depth value is no measurement if three things hold: more than SHARED of all depths have the
 # value, more than _SHARING of the frames have it at more than SHARED of their pixels, and it is
 # more than _SPIKE times as frequent as any value that is a measurement (our choice).
 SHARED, _SHARING, _SPIKE = 0.01, 0.25, 10
 _VALUES = 3  # a camera has at most so many values for no measurement (our choice)
+_FEW_VALUES = 10  # images of at most so many different depths do not tell (our choice)
 _BLACK = 0.02  # images are black if their median brightness, in [0, 1], is below this
 
 
@@ -105,8 +106,8 @@ def no_depth_values(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -
     """
     n_pixels, n_frames = counts
     is_shared = (n_pixels > SHARED * n_pixels.sum()) & (n_frames > _SHARING * len(frames))
-    # A camera that stands still tells nothing, nor do images of only a few different values.
-    is_shared &= (np.count_nonzero(n_pixels) > _SPIKE) & (frames.moved_mm.median() > 0)
+    is_moving = frames.moved_mm.median() > 0  # images of a camera that stands still do not tell
+    is_shared &= is_moving & (np.count_nonzero(n_pixels) > _FEW_VALUES)
     most_frequent = np.argsort(-n_pixels)[: _VALUES + 1]
     # Frequencies fall by a factor above _SPIKE after the last value that is no measurement. Among
     # measurements a camera's rounding makes some frequent, but none by so much.

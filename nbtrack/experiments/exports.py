@@ -146,12 +146,14 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
 
 
 def _export_trajectory(source: Path, format_name: str) -> tuple[str, str]:
-    """The tracked poses of a run in KITTI's format; and a summary.
+    """The tracked poses of a run in KITTI's format, in the recording's world; and a summary.
 
-    `format_name` is not used: this is the only format of trajectories.
+    A line holds the upper three rows of a pose's matrix. As in `trajectory.txt`, a first pose that
+    was given is left out. `format_name` is not used: this is the only format of trajectories.
     """
-    n_poses = len(runs.read_trajectory(source).frames)  # raises if the folder holds no run
-    _, T_world_camera = read_tum(source / "trajectory.txt")  # m, in the recording's world
+    runs.read_trajectory(source)  # raises if there is no run; its poses are in the map's world
+    _, T_world_camera = read_tum(source / "trajectory.txt")  # m
+    n_poses = len(T_world_camera)
     summary = f"{n_poses} poses, without a first one that was given, as three rows of numbers (m)"
     return number_lines(T_world_camera[:, :3].reshape(-1, 12)), summary
 

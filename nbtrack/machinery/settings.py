@@ -55,7 +55,7 @@ def read_setting(setting: str) -> dict[str, Any]:
 
     The value is TOML. A table in it sets several keys, and a bare word is a string. Raises
     ConfigError for a text without `=`, for a list, table or quoted string that is not TOML, and for
-    more than one setting in the text.
+    more than one setting in the text, or none.
     """
     key, equals, text = [part.strip() for part in setting.partition("=")]
     if not equals:
@@ -67,9 +67,11 @@ def read_setting(setting: str) -> dict[str, Any]:
         if text.startswith(("[", "{", '"', "'")):
             raise ConfigError(f"{text!r:.40} is no TOML: write \"{key}=['a', 'b']\"") from None
         parsed = {"value": text}  # a bare word is a string
-    if len(parsed) > 1:  # the text has line ends, after which TOML may set other names
-        raise ConfigError(f"setting {setting!r:.80} holds more than one: give each by itself")
-    return flat({key: parsed["value"]})
+    values = flat({key: parsed["value"]})
+    # After line ends TOML may set other names, and an empty table sets none.
+    if len(parsed) > 1 or not values:
+        raise ConfigError(f"setting {setting!r:.80} holds more than one, or none: give each alone")
+    return values
 
 
 def checked(config: Config, kind: type) -> Config:

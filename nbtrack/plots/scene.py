@@ -211,6 +211,6 @@ def draw_levels(
     axes: Axes, places: np.ndarray, values: np.ndarray, levels: Sequence[float], **look: object
 ) -> None:
     """Draw lines where the values at `places` (a grid on the page) equal one of `levels`."""
-    # matplotlib warns if no line is to be drawn.
-    if values.min() < max(levels) and min(levels) < values.max():
+    # Some versions of matplotlib warn if no level is among the values.
+    if any(values.min() < level < values.max() for level in levels):
         axes.contour(*np.moveaxis(places, -1, 0), values, levels, **look)

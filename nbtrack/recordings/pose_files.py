@@ -118,18 +118,23 @@ def check_rising(times: Times, source: Path) -> None:
 
 
 def check_order(files: list[Path]) -> None:
-    """Raises DataError if the frames may have another order than the files, sorted by numbers."""
+    """Raises DataError if the names leave open in which order the frames were recorded.
+
+    `files` are sorted by the numbers in their names.
+    """
     names = f"{files[0].parent}/{files[0].name}, {files[-1].name} and the others"
     # The names without their numbers must be equal: sorted words, as Feb and Jan, need not be in
     # the order of frames.
     words = {re.sub("[0-9]+", "0", path.stem.lower()) for path in files}
     # Either all names or none must hold a time since 1970.
     stamps = [stamp_in(path) for path in files]
+    are_times = None not in stamps
+    some_are_times = any(stamps) and not are_times
     # Decimals must be equally many, unless all names are times: 1.5 may be 1.50, which comes after
     # 1.25, or chapter 1.5, which comes before chapter 1.25.
     decimals = {tuple(map(len, re.findall(r"\d\.(\d+)", path.stem))) for path in files}
-    numbers_differ = None in stamps and (any(stamps) or len(decimals) > 1)
-    if len(words) > 1 or numbers_differ:
+    decimals_differ = len(decimals) > 1 and not are_times
+    if len(words) > 1 or some_are_times or decimals_differ:
         found = f"{names} differ in more than their numbers, or in how these are written"
         raise DataError(f"{found}, which tells no order: number the images as they were recorded")
     if len(files) > 1:
