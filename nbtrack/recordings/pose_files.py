@@ -21,7 +21,10 @@ _COLUMNS = "timestamp tx ty tz qx qy qz qw"
 # What a line of a pose file may hold, for messages.
 _POSE_LINE = "'timestamp tx ty tz qx qy qz qw', 16 or 12 numbers of a matrix, or 4 of a row of one"
 _LATEST = 1e11  # s: no timestamp in seconds is later; one in milliseconds since 1970 is larger
-_SLOWEST = 5.0  # s: frames that are farther apart see too little of the same to be tracked
+_EARLIEST = 9e8  # s: times since 1970 that are later (from July 1998 on) tell their unit
+# Frames that are farther apart (s) see too little of the same to be tracked.
+_SLOWEST = 5.0
+_SLOWEST_SINCE_1970 = 15.0  # where the times themselves tell the unit
 # A time since 1970 in a name: seconds with decimals (9 or 10 digits before the point), or milli-,
 # micro- or nanoseconds (13, 16 or 19 digits).
 _STAMP = re.compile(r"(?a)(?<!\d)(?<!\d\.)([1-9]\d{8,9}\.\d+|1\d{12}(?:\d{3}){0,2})(?!\.?\d)")
@@ -31,8 +34,9 @@ def in_seconds(times: Times) -> Times:
     """Convert times in seconds, or in milli-, micro- or nanoseconds, to seconds.
 
     The unit is the largest of these in which the median of all times is below `_LATEST`, and in
-    which frames are less than `_SLOWEST` apart if their times are whole numbers that begin near 0.
-    A time that is not below `_LATEST` in this unit becomes NaN.
+    which frames are less than `_SLOWEST` apart, or `_SLOWEST_SINCE_1970` if the median is one of a
+    time since 1970. How far frames are apart counts for whole numbers only: with decimals the unit
+    is likely a second. A time that is not below `_LATEST` in this unit becomes NaN.
 
     >>> in_seconds(np.array([1403636579763555584.0, 1403636579796888917.0])).round(2).tolist()
     [1403636579.76, 1403636579.8]
@@ -40,16 +44,18 @@ def in_seconds(times: Times) -> Times:
     [0.5, 0.6, nan]
     >>> in_seconds(np.array([0.0, 33.0, 67.0])).round(3).tolist()
     [0.0, 0.033, 0.067]
+    >>> in_seconds(1e9 * np.array([5000.0, 5000.5, 5001.0])).tolist()  # since the start of a device
+    [5000.0, 5000.5, 5001.0]
     """
     known = times[np.isfinite(times)]
     median = np.median(np.abs(known)) if len(known) else 0.0
-    step = 0.0  # stays 0, which fits every unit, unless times are whole numbers from near 0 on
+    step = 0.0  # fits every unit
     if len(known) > 1 and (known % 1 == 0).all():
-        median_step = np.quantile(np.abs(np.diff(known)), 0.5, method="lower")
-        step = median_step if np.abs(known[0]) <= 100 * median_step else 0.0
+        step = np.quantile(np.abs(np.diff(known)), 0.5, method="lower")
     units_s = np.array([1.0, 1e-3, 1e-6, 1e-9])
+    slowest = np.where(median * units_s > _EARLIEST, _SLOWEST_SINCE_1970, _SLOWEST)
     # `argmax` finds the first unit that fits. If none fits, it is 0: the unit is a second.
-    unit_s = units_s[((median * units_s < _LATEST) & (step * units_s < _SLOWEST)).argmax()]
+    unit_s = units_s[((median * units_s < _LATEST) & (step * units_s < slowest)).argmax()]
     return np.where(np.abs(times * unit_s) < _LATEST, times * unit_s, np.nan)
 
 
