@@ -94,7 +94,7 @@ FIGURES = {
     "samples": lambda s: plot_idea(IMAP_FIELD, s[0], {"": s.T_world_camera[0]}, (6, 8), "many"),
     "both losses": lambda s: plot_pose_losses(IMAP_FIELD, NEAR, s[0], 4.0),
     "no density": lambda s: plot_density(pose_losses(IMAP_FIELD, NEAR, s[0]), "elsewhere"),
-    "steps": lambda s: plots.plot_steps({"SDF": steps_of(s)}, s[0], s.T_world_camera[5], 0.02),
+    "steps": lambda s: plots.plot_steps({"SDF": steps_of(s)}, s[0], s.T_world_camera[5]),
     "queries": lambda s: plot_idea(
         SPHERE, s[0], dict(zip("ab", s.T_world_camera, strict=False)), (6, 8), "one", before=0.9
     ),
@@ -271,7 +271,7 @@ def test_steps_begin_at_their_start(sequence) -> None:
     errors_mm = by_step.lines[0].get_ydata()
     assert len(errors_mm) == 4
     assert errors_mm[0] == pytest.approx(50)
-    assert figure.get_suptitle() == f"SDF is {errors_mm[-1]:.0f} mm off after 3 steps"
+    assert figure.get_suptitle() == f"SDF ends {errors_mm[-1]:.0f} mm off after 3 steps"
 
 
 def test_a_method_keeps_its_color() -> None:
