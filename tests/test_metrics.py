@@ -118,10 +118,9 @@ def test_poses_that_cannot_be_compared() -> None:
     whole trajectory."""
     poses, spoilt = wandering(6), wandering(6)
     spoilt[4, 0, 3] = np.nan
-    for pair in ((spoilt, poses), (poses, spoilt), (poses[:1], poses), (poses[:0], poses[:0])):
-        says = f"{len(pair[0])} estimates, {len(pair[1])} true poses: "
-        with pytest.raises(DataError, match=says):
-            pose_errors(*pair)
+    for ours, true in ((spoilt, poses), (poses, spoilt), (poses[:1], poses), (poses[:0],) * 2):
+        with pytest.raises(DataError, match=f"{len(ours)} estimates, {len(true)} true poses: "):
+            pose_errors(ours, true)
     with pytest.raises(DataError, match="1 estimates, 6 true poses"):
         trajectory_metrics(poses[:1], poses)
 
