@@ -16,13 +16,14 @@ import nbformat
 from latex2mathml.converter import convert
 from nbconvert import HTMLExporter
 from nbconvert.filters.markdown_mistune import IPythonRenderer, MarkdownWithMath
-from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor
+from nbconvert.preprocessors import CellExecutionError, ExecutePreprocessor, TagRemovePreprocessor
 
 from nbtrack import load_preset, open_scenes
 from nbtrack.machinery.errors import NbtrackError
 
 ROOT = Path(__file__).resolve().parents[1]
 RED = "color: #c00000;"  # its contrast with white is 6.5, that of plain red 4.0
+NEEDS_KERNEL = "remove_output"  # nbconvert's usual tag: of cells that show something to be moved
 
 
 class PageRenderer(IPythonRenderer):
@@ -84,6 +85,8 @@ def html_of(notebook: nbformat.NotebookNode, index: str) -> str:
         exclude_input_prompt=True, exclude_output_prompt=True,
         filters={"markdown2html": MarkdownWithMath(PageRenderer(escape=False)).render},
     )  # fmt: skip
+    remover = TagRemovePreprocessor(remove_all_outputs_tags={NEEDS_KERNEL})
+    exporter.register_preprocessor(remover, enabled=True)
     page = exporter.from_notebook_node(notebook)[0].replace("color: red;", RED)
     return page.replace("<main>", contents_of(page, index) + "<main>", 1)
 

@@ -101,10 +101,11 @@ def test_links_lead_somewhere(pages: dict[Path, bs4.BeautifulSoup]) -> None:
 
 def test_a_page_loads_nothing_and_tells_what_it_is(pages: dict[Path, bs4.BeautifulSoup]) -> None:
     """Catches a script, a style sheet or an image from the network, a page without a language or a
-    title, and a picture without a description."""
+    title, a picture without a description, and a slider that cannot slide."""
     (page,) = (page for path, page in pages.items() if path.stem == FIRST.stem)
     assert not page.select("script, link, img[src^=http]")
     assert page.html["lang"] == "en"
     assert page.select("meta[name=viewport]")
     assert page.title.text.startswith("1. Map known rooms")
     assert not page.select("img[alt^='No description'], img[alt='']")
+    assert "interactive(" not in page.text

@@ -23,7 +23,7 @@ from nbtrack.fields import NetworkSettings, make_field
 from nbtrack.plots.idea import plot_idea
 from nbtrack.plots.movie import view_of
 from nbtrack.plots.network import plot_network
-from nbtrack.plots.pose_losses import distance_and_density, move_sideways, plot_density
+from nbtrack.plots.pose_losses import move_sideways, plot_density, plot_pose_losses, pose_losses
 from nbtrack.plots.scene import screen_axes
 from nbtrack.plots.style import PALETTE, method_colors
 from nbtrack.tracking import SdfSettings, StepBudget, Tracker, make_tracker
@@ -92,7 +92,8 @@ FIGURES = {
     "errors": lambda s: plots.plot_errors({"VR": FRAMES, "SDF": FRAMES}, "lost"),
     "curves": lambda s: plots.plot_curves(SWEEP, *SWEEP, "fast"),
     "samples": lambda s: plot_idea(IMAP_FIELD, s[0], {"": s.T_world_camera[0]}, (6, 8), "many"),
-    "no density": lambda s: plot_density(distance_and_density(IMAP_FIELD, NEAR, s[0]), "elsewhere"),
+    "both losses": lambda s: plot_pose_losses(IMAP_FIELD, NEAR, s[0], 4.0),
+    "no density": lambda s: plot_density(pose_losses(IMAP_FIELD, NEAR, s[0]), "elsewhere"),
     "steps": lambda s: plots.plot_steps({"SDF": steps_of(s)}, s[0], s.T_world_camera[5]),
     "queries": lambda s: plot_idea(
         SPHERE, s[0], dict(zip("ab", s.T_world_camera, strict=False)), (6, 8), "one", before=0.9
@@ -315,9 +316,9 @@ def test_a_movie_shows_every_frame(sequence) -> None:
     assert not np.array_equal(first, second)
 
 
-def test_a_camera_moves_along_its_own_axis(sequence) -> None:
-    """Catches offsets along the world's axes, and in metres."""
-    T_world_moved = move_sideways(sequence[2], 10.0).numpy()
+def test_sliders_move_the_camera_along_its_own_axes(sequence) -> None:
+    """Catches offsets along the world's axes, in metres, and a turn about another axis."""
+    T_world_moved = move_sideways(sequence[2], 10.0, 90.0).numpy()
     T_camera_moved = np.linalg.inv(sequence[2].T_world_camera) @ T_world_moved
     # A point 1 m ahead of the moved camera.
-    assert T_camera_moved @ [0, 0, 1, 1] == pytest.approx([0.1, 0, 1, 1], abs=1e-6)
+    assert T_camera_moved @ [0, 0, 1, 1] == pytest.approx([1.1, 0, 0, 1], abs=1e-6)

@@ -1,60 +1,101 @@
-"""Figures of distance and density around a frame's true pose, and of the steps of trackers."""
+"""Figures of both trackers' losses around a frame's true pose, and of the steps of trackers."""
 
 from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
 import torch
+import trimesh
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from nbtrack.core.arrays import Pose, Transform
+from nbtrack.core.camera import pixel_directions
 from nbtrack.core.geometry import transform_points
 from nbtrack.data.frame import Frame
 from nbtrack.fields import Field, LearnedField
 from nbtrack.plots.meshes import query_field
 from nbtrack.plots.style import DASHED, method_colors, new_axes, styled
-from nbtrack.tracking import Tracker
+from nbtrack.tracking import SdfTracker, StepBudget, Tracker, VrTracker
 
+_SDF_LOSS, _VR_LOSS = "SDF's loss (no unit)", "VR's loss (no unit)"
 _DISTANCE, _DENSITY = "mean |d| (cm)", "mean density (1/m)"
 _OFFSETS_CM = np.arange(-20, 21, 2)
+_COLORS = dict(zip((_SDF_LOSS, _VR_LOSS), method_colors(["SDF", "VR"]).values(), strict=True))
 
 
-def move_sideways(frame: Frame, x_cm: float) -> Transform:
-    """The true camera-to-world pose (m), moved along the camera's x axis."""
-    T_camera_moved = np.eye(4)
+def move_sideways(frame: Frame, x_cm: float, y_deg: float) -> Transform:
+    """The true camera-to-world pose (m), moved along the camera's x axis and turned about its y."""
+    T_camera_moved = trimesh.transformations.rotation_matrix(np.radians(y_deg), [0, 1, 0])
     T_camera_moved[0, 3] = x_cm / 100
     return torch.from_numpy(frame.T_world_camera @ T_camera_moved).float()
 
 
 @torch.no_grad()
-def distance_and_density(density: LearnedField, distance: Field, frame: Frame) -> pd.DataFrame:
-    """Means at the measured points of a frame, over offsets of the camera from its true pose.
+def pose_losses(
+    density: LearnedField, distance: Field, frame: Frame, y_deg: float = 0.0
+) -> pd.DataFrame:
+    """Losses of both trackers for a frame, over offsets of the camera from its true pose.
 
-    The camera is moved along its x axis (the index, in cm). The columns are the means of |d| in the
-    map `distance` and of the density in the map `density`, at the same pixels for all poses.
+    The camera is moved along its x axis (the index, in cm) and turned about its y axis by `y_deg`.
+    The columns are SDF's loss in the map `distance`, VR's loss in the map `density`, and the means
+    of |d| and of the density at the measured points. Losses are those of trackers with default
+    settings, for the same pixels at all poses and without randomness.
     """
     pixels = frame.measured_pixels()
-    # At most 128 pixels, which give smooth curves.
-    points_camera, _ = frame.points(*pixels[:, :: 1 + pixels.shape[1] // 128])
-    means = []
+    # At most 128 pixels, which give smooth curves and are fast enough for a slider.
+    rows, columns = pixels[:, :: 1 + pixels.shape[1] // 128]
+    directions_camera = pixel_directions(frame.camera, columns, rows)
+    color, depth = frame.at(rows, columns)
+    points_camera = directions_camera * depth[:, None]
+    T_true, budget = frame.T_world_camera, StepBudget(1)  # to construct trackers; losses need none
+    sdf, vr = SdfTracker(distance, T_true, budget), VrTracker(density, T_true, budget)
+    vr.generator = None  # without a generator samples along rays are not random
+    losses = []
     for x_cm in _OFFSETS_CM:
-        points_world = transform_points(move_sideways(frame, x_cm), points_camera)
+        T_world_camera = move_sideways(frame, x_cm, y_deg)
+        sdf_loss = sdf.loss(T_world_camera, directions_camera, color, depth)
+        vr_loss = vr.loss(T_world_camera, directions_camera, color, depth)
+        points_world = transform_points(T_world_camera, points_camera)
         mean_cm = 100 * distance(points_world)[1].abs().mean().item()
-        means.append([mean_cm, density(points_world)[1].mean().item()])
-    return pd.DataFrame(means, pd.Index(_OFFSETS_CM, name="x_cm"), [_DISTANCE, _DENSITY])
+        mean_density = density(points_world)[1].mean().item()
+        losses.append([sdf_loss.item(), vr_loss.item(), mean_cm, mean_density])
+    columns = [_SDF_LOSS, _VR_LOSS, _DISTANCE, _DENSITY]
+    return pd.DataFrame(losses, pd.Index(_OFFSETS_CM, name="x_cm"), columns)
+
+
+@styled
+def plot_pose_losses(
+    density: LearnedField, distance: Field, frame: Frame, y_deg: float = 0.0
+) -> Figure:
+    """Both losses of `pose_losses` along x.
+
+    Each loss has two curves: with the camera turned by `y_deg`, and a pale one without a turn. For
+    a slider: `interact(plot_pose_losses, density=fixed(...), ..., y_deg=(-10, 10))`.
+    """
+    straight = pose_losses(density, distance, frame)
+    turned = pose_losses(density, distance, frame, y_deg)
+    sdf_cm, vr_cm = turned[[_SDF_LOSS, _VR_LOSS]].idxmin()
+    title = f"Turned by {y_deg:g}°, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
+    panels = new_axes(title.replace("-", "−"), 2.9, 1, 2)[0]  # minus signs for hyphens
+    for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
+        axes.plot(straight[name], color=color, alpha=0.4, label="pale: not turned")
+        axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
+        axes.plot(turned[name].idxmin(), turned[name].min(), "v", color="0.3", label="lowest")
+        axes.axvline(0, label="the true pose", **DASHED)
+        axes.set(xlabel="camera off along x (cm)", ylabel=name)
+    return panels[0].figure.legend_below()
 
 
 @styled
 def plot_density(curves: pd.DataFrame, title: str = "") -> Figure:
-    """What `distance_and_density` returns, with a dot where each mean is best.
+    """The means of |d| and of the density of `pose_losses`, with a dot where each is best.
 
     A search would end where |d| is lowest, or where the density is highest.
     """
     panels = new_axes(title, 2.9, 1, 2)[0]
     sought = {_DISTANCE: "lowest", _DENSITY: "highest"}  # what a search looks for in each curve
-    colors = method_colors(["SDF", "VR"]).values()  # the maps are those of these trackers
-    for axes, (name, extreme), color in zip(panels, sought.items(), colors, strict=True):
+    for axes, (name, extreme), color in zip(panels, sought.items(), _COLORS.values(), strict=True):
         best_cm = curves[name].idxmin() if extreme == "lowest" else curves[name].idxmax()
         label = f"{extreme}, at {best_cm} cm"
         axes.plot(curves[name], color=color)
