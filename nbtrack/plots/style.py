@@ -25,7 +25,7 @@ _LABELS = (
     ("NeuS+ corrected (LM)", "NeuS+ corrected", "LM, corrected map", "greedy"),
     ("ICP", "at 5 Hz"),
     ("NeuS+ grid", "at 10 Hz", "most of the bias taken out"),
-    ("five rooms of the paper", "dataset's sensor"),
+    ("rooms of the paper", "dataset's sensor"),
     ("nine rooms of ours", "unbiased sensor"),
 )
 _FIXED = {label: color for color, labels in zip(PALETTE, _LABELS, strict=True) for label in labels}
