@@ -15,6 +15,7 @@ from nbtrack.core.geometry import transform_points
 from nbtrack.data.frame import Frame
 from nbtrack.data.pixels import Rays
 from nbtrack.fields import LearnedField
+from nbtrack.machinery.errors import ConfigError
 from nbtrack.plots.scene import draw_slice
 from nbtrack.plots.style import WIDTH, method_colors, new_axes, styled
 
@@ -75,10 +76,14 @@ def plot_idea(
 def _points_of_row(frame: Frame, row: int, column: int) -> tuple[Tensor, Tensor]:
     """The points (m, camera frame) of a row's measured pixels (n, 3), and of one of them (3,).
 
-    This one is the measured pixel nearest to (row, column); the row is that of this pixel. The
-    frame must have depth.
+    This one is the measured pixel nearest to (row, column); the row is that of this pixel.
+
+    Raises:
+        ConfigError: the frame has no depth.
     """
     pixels = frame.measured_pixels()
+    if not pixels.numel():
+        raise ConfigError("the frame has no depth: choose another one")
     away = (pixels - pixels.new_tensor([[row], [column]])).abs().sum(dim=0)
     row, column = pixels[:, away.argmin()]
     in_row = pixels[:, pixels[0] == row]

@@ -46,7 +46,8 @@ def plot_slice(
     norm = None  # the first slice makes the colour scale and its bar; the others take the scale
     mean_m = np.nanmean(sequence.T_world_camera[:, :3, 3] @ scene.up_of(sequence.T_world_camera))
     height = mean_m if height is None else height
-    above = f", {mean_m - height:.1f} m higher up" if abs(mean_m - height) > 0.05 else ""
+    side, away_m = "higher up" if mean_m > height else "lower down", abs(mean_m - height)
+    above = f", {away_m:.1f} m {side}" if away_m > 0.05 else ""
     for axes, field in zip(panels, drawn, strict=True):
         up, page = scene.draw_from_above(axes, {f"cameras{above}": sequence.T_world_camera})
         low, high = np.array([field.bounds.minimum, field.bounds.maximum]) @ page.T

@@ -46,6 +46,8 @@ def in_seconds(times: Times) -> Times:
     [0.0, 0.033, 0.067]
     >>> in_seconds(1e9 * np.array([5000.0, 5000.5, 5001.0])).tolist()  # since the start of a device
     [5000.0, 5000.5, 5001.0]
+    >>> in_seconds(np.array([1.4e9, 1.4e9 + 10])).tolist()  # a picture every ten seconds
+    [1400000000.0, 1400000010.0]
     """
     known = times[np.isfinite(times)]
     median = np.median(np.abs(known)) if len(known) else 0.0
