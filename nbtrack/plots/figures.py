@@ -218,7 +218,7 @@ def plot_curves(
     The names of the columns label the axes. If `x` holds texts, these keep the order of their first
     appearance, and points of different groups stand side by side without lines. If it holds numbers
     and every group has a single row, the rows are points beside their labels. A variant of a
-    method, which is named after a comma, has the method's mark and is dashed. If the table has
+    method, which is named after a comma, has the method's mark, hollow, and is dashed. If the table has
     columns `from` and `to`, they are drawn as intervals of y. `log` names the logarithmic axes;
     `line` is matplotlib's style of all lines, where "none" means points only.
     """
@@ -233,6 +233,7 @@ def plot_curves(
         method, is_variant, _ = label.partition(", ") if line == "-" else (label, "", "")
         mark = mark_of.setdefault(method, _MARKS[len(mark_of) % len(_MARKS)])
         look = {"linestyle": "--" if is_variant else line, "color": colors[label], "label": label}
+        look["markerfacecolor"] = "white" if is_variant else colors[label]
         axes.plot(rows[x], rows[y], mark, **look)
         if "from" in table:
             axes.vlines(rows[x], rows["from"], rows["to"], colors[label], linewidth=0.8)
