@@ -218,8 +218,8 @@ def plot_curves(
     The names of the columns label the axes. If `x` holds texts, these keep the order of their first
     appearance, and points of different groups stand side by side without lines. If it holds numbers
     and every group has a single row, the rows are points beside their labels. A variant of a
-    method, which is named after a comma, has the method's mark, hollow, and is dashed. If the table has
-    columns `from` and `to`, they are drawn as intervals of y. `log` names the logarithmic axes;
+    method, which is named after a comma, has the method's mark, hollow, and is dashed. If the table
+    has columns `from` and `to`, they are drawn as intervals of y. `log` names the logarithmic axes;
     `line` is matplotlib's style of all lines, where "none" means points only.
     """
     axes = style.new_axes(title, 3.6)[0, 0]

@@ -59,7 +59,7 @@ def extract_mesh(
 class ExactDistance(Field):
     """The exact distance (m) of a room as a field, with the bounds of a map and a grey colour."""
 
-    name, label, surface_level = "exact", "Exact distance", 0.0
+    name, label, surface_level = "exact", "exact distance", 0.0
 
     def __init__(self, room: Room, mapped: Field) -> None:
         super().__init__(mapped.bounds)

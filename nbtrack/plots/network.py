@@ -19,11 +19,11 @@ def plot_network(network: FourierMlp, value: str, title: str = "") -> Figure:
 
     `value` names the fourth output and its unit, such as "density (1/m)".
     """
-    hidden = f"{network.activation.__name__}(W h + b)"
+    hidden = f"{network.activation.__name__}(h W + b)"
     layers = [("sin(x B)", network.frequencies)]
     for layer in (network.layer_1, network.layer_2, network.layer_3, network.layer_4):
         layers.append((hidden, layer.weight.T))
-    layers.append(("W h + b", network.head.weight.T))
+    layers.append(("h W + b", network.head.weight.T))
     texts = [f"{name}\n{matrix.shape[0]} × {matrix.shape[1]}" for name, matrix in layers]
     texts = ["point\n3 (m, world)", *texts, f"sigmoid: colour (3)\n{value}"]
     widths = np.array([max(map(len, text.split("\n"))) for text in texts])
