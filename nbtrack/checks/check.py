@@ -80,7 +80,7 @@ class DataReport:
         # The first fault or doubt is in the verdict.
         texts = [f"  warning: {text}" for text in (self.faults + self.doubts)[1:]]
         texts += [f"  note: {text}" for text in (*recording.notes, *self.remarks)]
-        command = "data check" if self.faults else "track"
+        command = "track" if self.verdict == "read rightly" else "data check"
         lines = [
             f"{recording.name}: {recording.format.label}, {len(self.frames)} of {len(recording)} "
             f"frames have a pose, {camera.width} x {camera.height} px",
@@ -118,19 +118,18 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     declared = conventions[0]
     cloud = _cloud(as_declared, sequence)
     is_far = cloud.depth > far_limit(cloud.depth)
-    # Causes are fitted only to a gap that the best convention leaves, if this is the declared one.
+    # Causes are fitted to the gap that the best convention leaves.
     has_gap = best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
     has_enough = len(ids) >= _MIN_FRAMES or declared.is_far_apart  # few frames tell a large gap
-    can_fit = best is declared and has_gap and has_enough
-    misfits = fit_causes(frame_pairs, as_declared) if can_fit else []
-    main = main_misfits(frame_pairs, as_declared, misfits)
+    misfits = fit_causes(frame_pairs, best.reading) if has_gap and has_enough else []
+    main = main_misfits(frame_pairs, best.reading, misfits)
     step_m = findings.steps_of(frames, cloud.depth, recording.declared.depth_scale)
     misread = findings.misreading(declared, best, main, step_m)  # a list of sentences by their kind
     faults = [*findings.of_images(frames, no_depth, counts[0]), *misread.get("fault", [])]
     doubts, remarks = misread.get("doubt", []), misread.get("note", [])
     if best is declared:  # otherwise the numbers of poses and depths mean nothing
         faults += findings.of_poses(frames, recording) if "fault" not in misread else []
-        faults += findings.of_units(cloud.depth[~is_far])
+        doubts += findings.of_units(cloud.depth[~is_far])
         remarks += findings.of_depths(cloud.depth)
     if not (faults or doubts):
         doubts = list(findings.doubts_of_poses(conventions, recording, is_whole, frames))
@@ -191,9 +190,9 @@ def _read(
     - `measured`: the share of pixels with depth; `brightness`: the mean colour, in [0, 1];
     - `depth_step`: the greatest common divisor of the frame's depth values;
     - `is_repeated`: whether the depth image is that of the row before;
-    - `moved_mm`, `turned_deg`: how far the camera moved and turned since the recording's frame
-      before, and `off_mm`, how far it is off the middle between the frames before and after; NaN if
-      one of these has no pose.
+    - `moved_mm`, `turned_deg`: how far a frame the camera moved and turned since the recording's
+      last frame with a pose, and `off_mm`, how far it is off an even motion from there to the next
+      such frame; NaN where there is none before or after.
 
     Of the counts (2, 65536) the first row tells how often each depth value occurs, and the second
     in how many frames a share of the pixels above `findings.SHARED` has it. Images are read in
@@ -227,11 +226,18 @@ def _add_motion(frames: pd.DataFrame, T_world_camera: Poses) -> None:
 
     The index of the table holds numbers of frames. `T_world_camera` has the poses of all frames.
     """
-    moves_mm = 1e3 * np.diff(T_world_camera[:, :3, 3], axis=0, prepend=np.nan)
-    off_mm = np.diff(moves_mm, axis=0, append=np.nan) / 2  # from the middle of both neighbours
-    frames["moved_mm"] = np.linalg.norm(moves_mm, axis=1)[frames.index]
-    frames["turned_deg"] = np.array([np.nan, *_turned_deg(T_world_camera)])[frames.index]
-    frames["off_mm"] = np.linalg.norm(off_mm, axis=1)[frames.index]
+    numbers = np.flatnonzero(np.isfinite(T_world_camera[:, 0, 0]))  # of frames with a pose
+    T = T_world_camera[numbers]
+    moves_mm = 1e3 * np.diff(T[:, :3, 3], axis=0, prepend=np.nan)
+    gaps = np.diff(numbers, prepend=-1)[:, None]  # in frames
+    # From the place between both neighbours at which the frame lies in time.
+    speeds = moves_mm / gaps  # mm a frame
+    off_mm = (speeds - np.roll(speeds, -1, 0)) / (1 / gaps + 1 / np.roll(gaps, -1, 0))
+    motion = pd.DataFrame(index=numbers)
+    motion["moved_mm"] = np.linalg.norm(speeds, axis=1)
+    motion["turned_deg"] = np.array([np.nan, *_turned_deg(T)]) / gaps[:, 0]
+    motion["off_mm"] = np.linalg.norm(off_mm, axis=1)
+    frames[motion.columns] = motion
 
 
 def _cloud(as_declared: Reading, stored: RgbdSequence) -> pd.DataFrame:

@@ -34,9 +34,11 @@ _IN_WORDS = [" ".join(words) for three in permutations(_OPPOSITES) for words in 
 # takes the first of conventions that fit alike.
 AXES = [*_NAMES, *(w for w in _IN_WORDS if w not in (*_NAMES, *SPELLED_AXES.values()))]
 # Depth values a metre, common ones first: 1000 is millimetres, 5000 TUM, 6553.5 Replica, 4000
-# RealSense at 0.25 mm, 10,000 tenths of a millimetre, 8000 and 80,000 SUN3D (both times 8), 256
-# KITTI, 100 centimetres. Metres (1) and micrometres (1e6) come last, since 16 bits hold them badly.
-_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0, 256.0, 100.0, 1.0, 1e6)
+# RealSense at 0.25 mm, 10,000 tenths of a millimetre, 8000 and 80,000 SUN3D (both times 8), 512
+# 2D-3D-S, 256 KITTI, 100 centimetres. Metres (1) and micrometres (1e6) come last, since 16 bits
+# hold them badly.
+_SCALES = (1000.0, 5000.0, 6553.5, 4000.0, 10_000.0, 8000.0, 80_000.0)
+_SCALES += (512.0, 256.0, 100.0, 1.0, 1e6)
 # What a calibration looks like, and the factor that its focal lengths and principal point need.
 _CALIBRATIONS = {
     "one with its principal point in the middle of the image": 1.0,
@@ -156,9 +158,9 @@ def _best_of(conventions: list[Convention]) -> Convention:
     `conventions` have the common ones first.
 
     This candidate is clearly better if its mean gap is three times smaller than the declared one's,
-    or if its mean gap is smaller and clearly more points agree. The number of points alone is not
-    enough: as many or more agree if positions are mirrored along an axis along which the camera
-    hardly moved, or along which it looks.
+    or if the declared one's is unusual, its own smaller, and clearly more points agree. The number
+    of points alone is not enough: as many or more agree if positions are mirrored along an axis
+    along which the camera hardly moved, or along which it looks, or if surfaces are flat.
     """
     declared = conventions[0]
     near, far = PLAUSIBLE_DEPTH
@@ -166,7 +168,8 @@ def _best_of(conventions: list[Convention]) -> Convention:
     plausible = [c for c in meet if near <= c.depth_m <= far]
     highest = max((c.agreement for c in plausible), default=0.0)
     best = next((c for c in plausible if c.agreement >= _ALIKE * highest), declared)
-    times = 1 if best.is_clearly_better(declared) else _NEARER
+    is_usual = declared.apart <= declared.usual_apart
+    times = 1 if best.is_clearly_better(declared) and not is_usual else _NEARER
     # If no surfaces meet as declared, its mean gap is NaN. The comparison is false, as it should.
     return declared if best.apart >= declared.apart / times else best
 

@@ -28,6 +28,11 @@ _OF_STEP = 0.2
 # value, more than _SHARING of the frames have it at more than SHARED of their pixels, and it is
 # more than _SPIKE times as frequent as any value that is a measurement (our choice).
 SHARED, _SHARING, _SPIKE = 0.01, 0.25, 10
+# What a cause with several numbers leaves of the cost, at most. Where poses jump by 5 cm, or depth
+# is wrong at edges, six numbers leave 0.44 or more; of a camera beside its poses 0.06 (our choice).
+_MAX_COST_OF_SEVERAL = 0.4
+# Of a camera that turns less (degrees a frame), a surface may have one depth in all images.
+_TURNS_DEG = 0.1
 _VALUES = 3  # a camera has at most so many values for no measurement (our choice)
 _FEW_VALUES = 10  # images of at most so many different depths do not tell (our choice)
 _BLACK = 0.02  # images are black if their median brightness, in [0, 1], is below this
@@ -40,39 +45,53 @@ def misreading(
 
     `best` is from `fit_all`, `main` from `main_misfits`, and `step_m` from `steps_of`. The first of
     these that holds is said, and the dictionary is empty if none holds:
-    - Another convention than the declared one is the best: a "fault".
     - Coarse steps of depth explain the gaps: a "doubt", or a "note" if the gaps are usual.
-    - A cause explains the gaps: a "note" if usual sensors have such an error, else a "fault".
+    - Another convention than the declared one is the best, or a cause explains the gaps under the
+      best one, or both: a "fault", or a "note" if usual sensors have such an error.
     - Surfaces lie apart without a known cause: a "doubt", or a "fault" if they lie far apart.
     """
-    depth_mm = 1e3 * declared.depth_m
-    usual_mm, apart_mm = declared.usual_apart * depth_mm, declared.apart * depth_mm
+    usual_mm = 1e3 * declared.usual_apart * declared.depth_m
+    apart_mm = 1e3 * declared.apart * declared.depth_m
     apart = "hardly meet" if np.isnan(apart_mm) else f"lie {apart_mm:.0f} mm apart"
     if best is declared and apart_mm < _OF_STEP * 1e3 * step_m:
         advice = "use the camera's own depth files, or expect no better poses"
         text = f"depths come in steps of {100 * step_m:.1f} cm: {advice}"
         return {"note" if declared.apart <= declared.usual_apart else "doubt": [text]}
+    parts, kind, left = [], "fault", best.apart
     if best is not declared:
-        reading, name, left_mm = best.reading, str(best), 1e3 * best.apart * best.depth_m
-        kind = "fault"
-    elif main and main[0].apart <= declared.usual_apart:
-        reading, left_mm = main[0].reading, main[0].apart * depth_mm
-        name = ", or as well that ".join(str(misfit) for misfit in main)
-        kind = "note" if main[0].is_usual else "fault"
-    elif declared.overlap >= MIN_OVERLAP and declared.apart > declared.usual_apart:
-        text = (
-            f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), "
-            "and nothing that is tried explains it: no other axes, units or directions of poses "
-            "and depth, no late depth, no focal lengths or principal point, no error of depth (a "
-            "factor of 0.2 to 1.8, a length, a square), no offset of the camera. What cannot be "
-            "told: poses that drift, jump or have a scale of their own, a lens's distortion, and "
-            "depth images that hold no depth (disparity, half floats, each frame scaled by itself)"
-        )
-        return {"fault" if declared.is_far_apart else "doubt": [text]}
-    else:
+        parts.append(f"{best}; {remedy(best.reading, declared.reading)}")
+    main = [misfit for misfit in main if _explains(misfit, best)]
+    if main and not (parts and main[0].is_usual):
+        names = ", or as well that ".join(str(misfit) for misfit in main)
+        parts.append(f"{names}; {remedy(main[0].reading, best.reading)}")
+        kind, left = "note" if main[0].is_usual else "fault", main[0].apart
+    if parts:
+        left_mm = 1e3 * left * best.depth_m
+        tail = f"surfaces that two frames see then lie {left_mm:.0f} mm apart; as declared they"
+        return {kind: [f"{', and then '.join(parts)} ({tail} {apart})"]}
+    if declared.overlap < MIN_OVERLAP or not declared.apart > declared.usual_apart:
         return {}
-    tail = f"surfaces that two frames see then lie {left_mm:.0f} mm apart; as declared they {apart}"
-    return {kind: [f"{name}; {remedy(reading, declared.reading)} ({tail})"]}
+    text = (
+        f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), and "
+        "nothing that is tried explains it by itself: no other axes or directions of poses and "
+        "depth, no usual unit, no depth that comes up to ten frames late, no focal lengths or "
+        "principal point, no error of depth (a factor of 0.2 to 1.8, a length, a square), no "
+        "offset of the camera. What cannot be told: two mistakes at once, poses that drift, jump, "
+        "belong to other frames or have a scale of their own, things that move, a lens's "
+        "distortion, and depth images that hold no depth (disparity, half floats, each frame "
+        "scaled by itself)"
+    )
+    return {"fault" if declared.is_far_apart else "doubt": [text]}
+
+
+def _explains(misfit: Misfit, best: Convention) -> bool:
+    """Whether surfaces lie as near with the cause as those of right recordings, and because of it.
+
+    Several numbers fit also what they do not cause. So if surfaces lie near without the cause, too,
+    one of several numbers must leave little of the cost.
+    """
+    is_sure = len(misfit.numbers) == 1 or misfit.cost_left < _MAX_COST_OF_SEVERAL
+    return misfit.apart <= best.usual_apart and (best.apart > best.usual_apart or is_sure)
 
 
 def doubts_of_poses(
@@ -91,23 +110,27 @@ def doubts_of_poses(
     if declared.overlap < MIN_OVERLAP or np.isnan(declared.apart):
         reason = f"two frames see too little of the same ({declared.overlap:.0%} of the points, "
         reason += f"whose neighbours need a depth, which {measured:.0%} of the pixels have)"
+        moved_m = frames.moved_mm.median() / 1e3
+        reason += f"; the camera moves {moved_m:.2g} m a frame" if moved_m > 0 else ""
         yield f"{file} is not proved: {reason}: check it, and a piece with smaller steps"
     elif needs_proof and alike:
-        reason = f"the camera moves too little to tell {len(alike)} other conventions apart"
+        reason = "the camera moves too little, or surfaces lie too far apart, to tell "
+        reason += f"{len(alike)} other conventions apart"
         yield f"{file} is not proved: {reason}, such as {alike[0]}"
 
 
 def no_depth_values(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> list[int]:
     """The depth values, at most `_VALUES`, that the camera gives for no measurement.
 
-    Many pixels share such a value, although the camera moves. `counts` and `frames` are those of
+    Many pixels share such a value, although the camera turns. `counts` and `frames` are those of
     `check`: `counts[0]` tells how often each depth value occurs, and `counts[1]` in how many frames
     a share of the pixels above `SHARED` has it.
     """
     n_pixels, n_frames = counts
     is_shared = (n_pixels > SHARED * n_pixels.sum()) & (n_frames > _SHARING * len(frames))
-    is_moving = frames.moved_mm.median() > 0  # images of a camera that stands still do not tell
-    is_shared &= is_moving & (np.count_nonzero(n_pixels) > _FEW_VALUES)
+    is_shared &= (frames.turned_deg.mean() > _TURNS_DEG) & (
+        np.count_nonzero(n_pixels) > _FEW_VALUES
+    )
     most_frequent = np.argsort(-n_pixels)[: _VALUES + 1]
     # Frequencies fall by a factor above _SPIKE after the last value that is no measurement. Among
     # measurements a camera's rounding makes some frequent, but none by so much.
@@ -130,12 +153,10 @@ def of_images(
         found = f"{often[no_depth].sum() / often.sum():.0%} of the depths are "
         found += " or ".join(map(str, no_depth))
         yield f"{found}, which is no measurement; set no_depth = {no_depth} in sequence.toml"
-    # The first frame repeats none, so that the share is below 1 and 1 / (1 - repeated) is finite.
     repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
     if repeated > _MIN_REPEATED:
         found = f"{repeated:.0%} of the depth images repeat the one before, though the poses move"
-        every = max(2, round(1 / (1 - repeated)))  # ::2 leaves out rare repetitions, too
-        yield f"{found}: leave them out: --frames ::{every} of map and track"
+        yield f"{found}: leave the repetitions out of the recording, or give them no pose"
     if frames.brightness.median() < _BLACK:
         options = "--set tracking.lm.lambda_intensity=0, or tracking.sdf.lambda_color=0 for sdf"
         yield f"the colour images are black: check their folder, or track without colour: {options}"
@@ -161,14 +182,14 @@ def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
 
 
 def of_units(depth: pd.Series) -> Iterator[str]:
-    """A fault if the median depth (m) is too small or too large for a depth camera.
+    """A doubt if the median depth (m) is too small or too large for a depth camera.
 
     Depths and poses agree with each other even so, if both have the same wrong unit.
     """
     near, far = PLAUSIBLE_DEPTH
     median = depth.median()
     if median < near or median > far:
-        advice = "set depth_scale, the depth values a metre, in sequence.toml"
+        advice = "if its unit and that of the poses are others, set depth_scale in sequence.toml"
         yield f"the median depth is {median:.3g} m, outside {near:g} to {far:g} m: {advice}"
 
 
