@@ -10,7 +10,8 @@ import jinja2
 _SPECIAL = {character: rf"\{character}" for character in "_&%$#{}"}
 _SPECIAL |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 # What stays as it is in an author's LaTeX: formulas, references, commands, escaped characters.
-_AS_IS = r"\$[^$]+\$|\\(?:\w*ref|cite\w*)\*?\{[^}]*\}|\\[a-zA-Z]+|\\[^a-zA-Z\s]"
+_AS_IS = r"\$[^$]+\$|\\\(.+?\\\)|\\(?:\w*ref|cite\w*|label|ensuremath)\*?\{[^}]*\}"
+_AS_IS += r"|\\[a-zA-Z]+|\\[^a-zA-Z\s]"
 # Group 1 is what stays. Without it, the match is a special character, to be escaped.
 _AUTHORS = re.compile(rf"({_AS_IS})|[%&#_^$\\]")
 _KINDS = {"table_1": "ate", "table_2": "runtime", "table_3": "beyond"}  # by a file's stem

@@ -132,8 +132,9 @@ def test_a_unit_that_only_the_depth_tells(tmp_path: Path) -> None:
     assert said.startswith("the median depth is 0.189 m")
 
 
-def test_frames_without_pose(box: Path) -> None:
-    """Catches a motion measured across a gap, and frames that slip against their depth."""
+def test_frames_without_pose(box: Path, tmp_path: Path) -> None:
+    """Catches a motion measured across a gap, frames that slip against their depth, and an odd pose
+    between lost ones that nobody looks at."""
     poses = as_written(walk(N_FRAMES), "opengl")
     poses[[0, 6, 7]] = np.nan
     rewrite_poses(box, poses)
@@ -142,6 +143,11 @@ def test_frames_without_pose(box: Path) -> None:
     assert report.best.apart < 0.01
     assert report.frames.moved_mm.max() == pytest.approx(MOVED_MM)
     assert report.frames.turned_deg.max() == pytest.approx(TURNED_DEG)
+    every_second = as_written(BESIDE, "opengl")
+    every_second[::2] = np.nan
+    rewrite_poses(write_box(tmp_path / "beside", BESIDE), every_second)
+    (said,) = check(tmp_path / "beside").warnings
+    assert said.startswith("1 of 8 poses lie up to 40 cm beside")
 
 
 def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:

@@ -268,7 +268,8 @@ def test_formats_are_told_apart(plain: Path, tmp_path: Path) -> None:
 
 
 def test_a_lens_by_any_name(plain: Path) -> None:
-    """Catches a lens that a camera file gives under another name and that is ignored in silence."""
+    """Catches a lens that a camera file gives under another name and that is ignored in silence, or
+    one without distortion that is refused for its name."""
     seen = [read_sequence(plain).depths_mm]
     lens = [0.5, -2.7, 0.001, -0.002, 1.6, 0.4, -2.5, 1.5]
     named = dict(zip(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), lens, strict=True))
@@ -281,6 +282,8 @@ def test_a_lens_by_any_name(plain: Path) -> None:
         seen.append(read_sequence(plain).depths_mm)
     assert (seen[0] != seen[1]).any()
     assert all(np.array_equal(seen[1], depths) for depths in seen[2:])
+    recordings.change_camera(plain, **dict.fromkeys(named), coeffs=[0] * 5, model="fisheye")
+    assert np.array_equal(read_sequence(plain).depths_mm, seen[0])  # a lens that does nothing
     recordings.change_camera(plain, tangential=[0, 0.1])
     with pytest.raises(DataError, match=r"tangential is .*, which is not used"):
         read_sequence(plain)

@@ -143,11 +143,11 @@ def test_table_3(tmp_path: Path, coarse_methods: None, monkeypatch) -> None:
     assert RATES_3_HZ[0] == 30
     monkeypatch.setattr("nbtrack.experiments.bench.RATES_3_HZ", RATES_3_HZ[:1])
     words = tiny_words("scenes.names=office", "scenes.track_frames=:2", "tracking.lm.voxel=0.3")
-    words += ["--no-still", "--set", "scenes.labels=['office=My_1']", "--caption"]
+    words += ["--no-still", "--set", "scenes.labels=['office=My_1 [2]']", "--caption"]
     assert main(["tables", "--beyond", "--workers", "1", "--out", str(tmp_path), *words]) == 0
     assert len(pd.read_csv(tmp_path / "table_3.csv")) == len(TABLE_3)
     latex = (tmp_path / "table_3.tex").read_text()
-    assert latex.count("NeuS+ baked (LM)") == latex.count(r" & My\_1 ") == 1
+    assert latex.count("NeuS+ baked (LM)") == latex.count(r"My\_1\\{}[2]") == 1
     assert "best at this rate).}\n" in latex
 
 

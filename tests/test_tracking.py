@@ -235,6 +235,16 @@ def test_an_estimate_is_the_users_own() -> None:
     assert np.isfinite(np.stack(tracker.estimates)).all()
 
 
+@pytest.mark.parametrize("pose", [2 * torch.eye(4), torch.eye(4)[None], np.eye(3)])
+def test_a_pose_that_a_tracker_of_ones_own_gives(pose) -> None:
+    """Catches errors of an absurd size, or torch's words, where an own tracker gives no pose."""
+    tracker = Sliding(BoxRoom(), np.eye(4), StepBudget(1))
+    tracker.T_world_camera = pose
+    tracker.step = lambda: torch.zeros(())
+    with pytest.raises(DataError, match="no rigid transform"):
+        tracker.track(walk(1)[0])
+
+
 def test_motion_models() -> None:
     """Catches velocities of the world, which leave a circle along its tangent, or of nothing."""
     start, step = poses_at([[1, 2, 3], [0.05, 0, 0]], [[0.3, -0.5, 0.2], [0, 0.1, 0]])

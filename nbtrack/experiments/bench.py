@@ -41,9 +41,9 @@ def tables_command(options: Namespace) -> None:
 
     Raises NbtrackError at the end if runs failed, whose cells are then empty.
     """
-    # The value of a setting is TOML, which writes a list of texts as Python prints it.
-    names = [f"scenes.names={options.scenes.split(',')}"] if options.scenes else []
-    preset = load_preset(options.preset, options.config, [*options.settings, *names])
+    preset = load_preset(options.preset, options.config, options.settings)
+    if options.scenes:
+        preset = preset.with_values({"scenes.names": options.scenes.split(",")})
     usual = TABLE_3 if options.beyond else TABLE_1
     methods = find_methods(options.method.split(",") if options.method else usual)
     # The following lines check the options, before a room is made.

@@ -68,7 +68,8 @@ class Registry(UserDict[str, Entry]):
             try:
                 entry = pkgutil.resolve_name(entry)
             except (ImportError, AttributeError, ValueError) as error:
-                raise ConfigError(f"{name!r} cannot be loaded from {entry} ({error})") from error
+                found = f"{name!r} cannot be loaded from {entry} ({error})"
+                raise ConfigError(f"{found}: install it, or remove this entry") from error
             self[name] = entry
         return entry
 

@@ -27,7 +27,8 @@ _OTHER_NAMES = {"w": "width", "h": "height", "coeffs": "distortion", "scale": "d
 _COUNTS = dict.fromkeys(("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *_LENS), (1,))
 _COUNTS |= {"intrinsic_matrix": (9,), "distortion": (0, 4, 5, 8, 12, 14)}
 _ADVICE = (
-    "write finite numbers: width and height in whole pixels, both or none, depth_scale above 0, "
+    "write finite numbers: fx, fy, cx and cy or intrinsic_matrix, width and height in whole "
+    "pixels, both or none, depth_scale above 0, "
     f"OpenCV's lens as distortion or by {', '.join(_LENS)}, and undistort images of another lens"
 )
 # Names of entries that are not read but may tell of another lens or unit, and the values (in lower
@@ -94,8 +95,9 @@ def calibration(path: Path, K: Float[np.ndarray, "3 3"], size: tuple | None = No
         return Calibration(path, fx, fy, principal_point=(cx + 0.5, cy + 0.5), size=size)
     raise DataError(
         f"{path} gives the camera matrix {K.tolist()}: it must be fx 0 cx, 0 fy cy, 0 0 1 in "
-        "pixels, without skew, the focal lengths positive, all finite; calibrate anew, or write a "
-        "negative fy (of a y axis that points up) positive and take the axes from `data check`"
+        "pixels row by row, without skew, the focal lengths positive, all finite; calibrate anew, "
+        "or write a negative fy (of a y axis that points up) positive and take the axes from "
+        "`data check`"
     )
 
 
@@ -136,9 +138,12 @@ def _from_json(path: Path) -> Calibration:
     entries = {_OTHER_NAMES.get(key, key): value for key, value in camera.items()}
     unused = tuple(sorted(entries.keys() - _COUNTS.keys()))
     with naming_damaged(path, "description of a camera", _ADVICE):
-        for key in filter(_TELLING.match, unused):
-            _check_unused(key, entries[key])
         numbers = {key: _numbers(key, entries[key]) for key in entries.keys() & _COUNTS.keys()}
+        # Without distortion it does not matter what the lens is called.
+        is_ideal = "distortion" in numbers and not any(numbers["distortion"])
+        for key in filter(_TELLING.match, unused):
+            if not (is_ideal and key.endswith("model")):
+                _check_unused(key, entries[key])
         # Entries that are one number: all but a matrix and a list of distortion.
         single = {key: values[0] for key, values in numbers.items() if len(values) == 1}
         lens = tuple(numbers.get("distortion", [single.get(key, 0.0) for key in _LENS]))
@@ -148,11 +153,11 @@ def _from_json(path: Path) -> Calibration:
         has_size = "width" in single or "height" in single
         # A width without a height is a KeyError, which `naming_damaged` makes a DataError.
         size = (int(single["width"]), int(single["height"])) if has_size else None
-        # A missing number is NaN, which `calibration` refuses.
-        K = camera_matrix(*[single.get(key, np.nan) for key in ("fx", "fy", "cx", "cy")])
         if "intrinsic_matrix" in numbers:
             # The file has the matrix column by column.
             K = np.reshape(numbers["intrinsic_matrix"], (3, 3)).T
+        else:  # a missing number is a KeyError
+            K = camera_matrix(*[single[key] for key in ("fx", "fy", "cx", "cy")])
     return replace(calibration(path, K, size), distortion=lens, depth_scale=scale, unused=unused)
 
 

@@ -243,7 +243,14 @@ class Tracker(abc.ABC):
         synchronize(self.device)
         allowed.close()  # after `break`, a clock budget counts the last step here
         seconds = time.perf_counter() - began
-        pose = self.T_world_camera.detach().cpu().double().numpy().copy()
-        if not np.isfinite(pose).all():
+        if not torch.as_tensor(self.T_world_camera).isfinite().all():
             raise NumericalError(f"the pose of {frame.name} is not finite: lower learning rates")
-        return Estimate(pose, not frame.has_depth, steps, seconds, float(loss), self.report())
+        # A tracker of one's own may give any pose.
+        return Estimate(
+            checked_pose(self.T_world_camera),
+            not frame.has_depth,
+            steps,
+            seconds,
+            float(loss),
+            self.report(),
+        )
