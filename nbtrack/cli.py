@@ -235,5 +235,7 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
             if given in [word.partition(":")[0] for word in words.split()]
         ]
         hint = f"only for {', '.join(takers)}" if takers else nearest_name(given, known)
+        if not given.startswith("-"):
+            hint = "give the command no more than it takes"
         options.parser.error(f"unknown argument {unknown[0]!r}: {hint}")
     return options

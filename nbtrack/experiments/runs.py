@@ -48,12 +48,14 @@ def is_own_output(folder: Path) -> bool:
 def prepare(folder: Path | None) -> None:
     """Mark a folder as one for nbtrack's results, before any work. None means no folder.
 
-    Raises ConfigError if the folder holds a recording, or if it is not marked yet and holds files
-    with the names of results; OSError if nothing can be written.
+    Raises ConfigError if it is a file, if it holds a recording, or if it is not marked yet and
+    holds files with the names of results; OSError if nothing can be written.
     """
     if folder is None:
         return
     check_no_recording(folder)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"{folder} is a file: --out takes a folder")
     foreign = [path.name for name in _RESULTS for path in sorted(folder.glob(name))]
     if foreign and not is_own_output(folder):
         raise ConfigError(f"{folder} has a {foreign[0]} that may not be nbtrack's: move it away")
