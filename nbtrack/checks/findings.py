@@ -50,7 +50,6 @@ def misreading(
       best one, or both: a "fault", or a "note" if usual sensors have such an error.
     - Surfaces lie apart without a known cause: a "doubt", or a "fault" if they lie far apart.
     """
-    usual_mm = 1e3 * declared.usual_apart * declared.depth_m
     apart_mm = 1e3 * declared.apart * declared.depth_m
     apart = "hardly meet" if np.isnan(apart_mm) else f"lie {apart_mm:.0f} mm apart"
     if best is declared and apart_mm < _OF_STEP * 1e3 * step_m:
@@ -69,8 +68,14 @@ def misreading(
         left_mm = 1e3 * left * best.depth_m
         tail = f"surfaces that two frames see then lie {left_mm:.0f} mm apart; as declared they"
         return {kind: [f"{', and then '.join(parts)} ({tail} {apart})"]}
+    return _unexplained(declared, apart)
+
+
+def _unexplained(declared: Convention, apart: str) -> dict[str, list[str]]:
+    """Say that surfaces lie apart without a known cause, if they do: see `misreading`."""
     if declared.overlap < MIN_OVERLAP or not declared.apart > declared.usual_apart:
         return {}
+    usual_mm = 1e3 * declared.usual_apart * declared.depth_m
     text = (
         f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), and "
         "nothing that is tried explains it by itself: no other axes or directions of poses and "
