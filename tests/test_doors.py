@@ -26,14 +26,7 @@ from nbtrack.machinery.files import absolute
 from nbtrack.machinery.settings import read_setting
 from nbtrack.mapping.files import MAP_FILE, Map, read_map, write_map
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.tracking import (
-    ClockBudget,
-    StepBudget,
-    make_budget,
-    make_tracker,
-    paper_steps,
-    track_sequence,
-)
+from nbtrack.tracking import ClockBudget, StepBudget, make_budget, paper_steps, track_sequence
 from nbtrack.tracking.methods import METHODS, find_methods
 from nbtrack.tracking.paper import SdfSettings, SdfTracker
 
@@ -50,7 +43,7 @@ def mapped(sequence=SEQUENCE, name="neus", settings=None, network=NETWORK, **mor
 def tracker(field=None, pose=None, name="sdf", budget=3, **options):
     pose = np.eye(4) if pose is None else pose
     settings = SdfSettings(**{"n_pixels": 16} | options) if name == "sdf" else None
-    return make_tracker(name, field or BoxRoom(), pose, StepBudget(budget), settings)
+    return nbtrack.make_tracker(name, field or BoxRoom(), pose, StepBudget(budget), settings)
 
 
 def scenes() -> dict:
@@ -100,7 +93,7 @@ REFUSED = {
     "images for a frame": lambda: tracker().track(SEQUENCE.colors[0]),
     "a number for a budget": lambda: SdfTracker(BoxRoom(), np.eye(4), 20),
     "a number for one frame": lambda: tracker().track(SEQUENCE[1], 5),
-    "no settings": lambda: make_tracker("sdf", BoxRoom(), np.eye(4), StepBudget(1), {}),
+    "no settings": lambda: nbtrack.make_tracker("sdf", BoxRoom(), np.eye(4), StepBudget(1), {}),
     "fewer times": lambda: replace(SEQUENCE, times=SEQUENCE.times[:2]),
     "fewer numbers": lambda: replace(SEQUENCE, frame_ids=SEQUENCE.frame_ids[:2]),
     "a text for a length": lambda: replace(CAMERA, fx="24"),
@@ -187,10 +180,9 @@ def everything() -> list[np.ndarray]:
     grid = mapped(name="grid_plus", settings=GridPlusMapping(**SMALL), network=GridNetwork())
     imap = mapped(name="imap", settings=MappingSettings(**SMALL))
     better = correction.correct_map(mapped(), SEQUENCE, 0.3).field
-    fields = {"vr": imap.field, "sdf": grid.field, "lm": better}
     paths = [
         track_sequence(tracker(field, name=name), SEQUENCE).T_estimated
-        for name, field in fields.items()
+        for name, field in {"vr": imap.field, "sdf": grid.field, "lm": better}.items()
     ]
     return [*paths, *imap.field.render_view(CAMERA, np.eye(4)), better.volume.numpy()]
 

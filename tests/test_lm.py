@@ -28,13 +28,6 @@ def begun(field: Field = ROOM, **settings: float) -> LmTracker:
     return LmTracker(field, T_TRUE, StepBudget(1), LmSettings(**settings))
 
 
-def mapped_from(T_world_camera: np.ndarray) -> BakedField:
-    """The room as a map that was made from one pose."""
-    field = BakedField(narrow_room(), 0.04)
-    field.viewpoints = Viewpoints(T_world_camera[None], view_of(FRAME)[None])
-    return field
-
-
 def run(tracker: LmTracker, T_start: np.ndarray, steps: int, frame: Frame = FRAME) -> bool:
     """Whether the tracker then says that it is lost."""
     tracker.estimates = [T_start]
@@ -77,26 +70,21 @@ def test_without_colour_no_picture_counts(twist: np.ndarray) -> None:
 
 
 def test_a_hopeless_start_is_followed_by_restarts_from_the_last_good_pose() -> None:
-    """Catches a run that one bad burst ends, resumed or not: the motion model points astray."""
+    """Catches a run that one bad burst ends, resumed or not: the motion model points astray; and a
+    last good pose, or being lost, that outlives a restart elsewhere: what a subclass says that it
+    remembers is reset without its doing."""
     before, alone, resumed = begun(), begun(n_restarts=0), begun()
     assert not run(before, T_TRUE, 20)
+    assert not run(alone, T_TRUE, 20)
     turned = retract(T_TRUE, FAR)
     assert run(alone, turned, 200)
     assert errors(alone)[0] > 0.2
     resumed.restore(before.state())
     assert not run(resumed, turned, 200)
     assert errors(resumed)[0] < 0.01
-
-
-def test_a_restart_forgets_the_past() -> None:
-    """Catches a last good pose, or being lost, that outlives a restart elsewhere: what a subclass
-    says that it remembers is reset without its doing."""
-    tracker = begun(n_restarts=0)
-    assert not run(tracker, T_TRUE, 20)
-    assert run(tracker, retract(T_TRUE, FAR), 200)
-    assert (tracker.was_lost, tracker.last_good is None) == (True, False)
-    tracker.restart(T_TRUE)
-    assert (tracker.was_lost, tracker.last_good) == (False, None)
+    assert (alone.was_lost, alone.last_good is None) == (True, False)
+    alone.restart(T_TRUE)
+    assert (alone.was_lost, alone.last_good) == (False, None)
 
 
 def test_a_field_is_asked_on_a_grid_of_the_voxel_that_is_set() -> None:
@@ -139,11 +127,10 @@ def test_a_pose_that_still_moves_when_the_budget_ends_is_lost() -> None:
 def test_intensities_speak_against_a_pose_by_what_is_usual(monkeypatch) -> None:
     """Catches a pose on a surface that the map made up: points fit there, but intensities are off
     by several times what is usual in the map; and a dark picture that is taken for one."""
-    pictures = {"same": FRAME.color, "blended": BLENDED, "dark": 0 * BLENDED}
     told = {}
     for usual_mad in (0.002, 0.02):
         monkeypatch.setattr(ROOM, "accuracy", Accuracy(intensity_mad=usual_mad))
-        for name, color in pictures.items():
+        for name, color in {"same": FRAME.color, "blended": BLENDED, "dark": 0 * BLENDED}.items():
             tracker = begun(n_restarts=0, lambda_intensity=1e-6)  # which no pose follows
             run(tracker, T_TRUE, 20, replace(FRAME, color=color))
             told[name, usual_mad] = tracker.report()["p_lost"]
@@ -154,7 +141,10 @@ def test_intensities_speak_against_a_pose_by_what_is_usual(monkeypatch) -> None:
 
 def test_a_lost_camera_is_looked_for_at_its_last_good_pose_too() -> None:
     """Catches a camera that stood still, lost for good: hypotheses lie near mapped poses alone."""
-    tracker = begun(mapped_from(retract(T_TRUE, np.array([0, 0, 0, 5.0, 5, 5]))))
+    field = BakedField(narrow_room(), 0.04)
+    T_mapped = retract(T_TRUE, np.array([0, 0, 0, 5.0, 5, 5]))
+    field.viewpoints = Viewpoints(T_mapped[None], view_of(FRAME)[None])
+    tracker = begun(field)
     assert not run(tracker, T_TRUE, 20)
     assert not run(tracker, retract(T_TRUE, FAR), 60)
     assert errors(tracker)[0] < 0.01
@@ -168,9 +158,8 @@ def test_a_doubtful_pose_is_confirmed_or_others_are_tried() -> None:
         depth_mm, steps = FRAME.depth_mm.clone(), []
         depth_mm[:, :columns] = (0.7 * depth_mm[:, :columns]).to(depth_mm.dtype)
         for n_restarts in (0, 8):
-            tracker = begun(n_restarts=n_restarts)
             seen = replace(FRAME, depth_mm=depth_mm)
-            steps.append(tracker.track(seen, StepBudget(60)).steps)
+            steps.append(begun(n_restarts=n_restarts).track(seen, StepBudget(60)).steps)
         further[columns] = steps[1] - steps[0]
     assert further == {40: 1, 36: 8}
 
@@ -189,8 +178,7 @@ def test_poses_keep_their_digits() -> None:
     """Catches double poses that pass through single precision at every frame, and a frame without
     depth of which the tracker says nothing."""
     T_start = retract(T_TRUE, np.array([0, 0, 0, 1 / 3, 1 / 7, -1 / 9]))
-    tracker = LmTracker(ROOM, T_start, StepBudget(1))
     blank = replace(FRAME, depth_mm=0 * FRAME.depth_mm)  # where nothing is seen the start stays
-    estimate = tracker.track(blank)
+    estimate = LmTracker(ROOM, T_start, StepBudget(1)).track(blank)
     np.testing.assert_allclose(estimate.T_world_camera, T_start, rtol=0, atol=1e-15)
     assert estimate.report == {"inlier_ratio": 0.0, "p_lost": 1.0, "lost": True}

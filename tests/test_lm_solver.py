@@ -82,8 +82,7 @@ def test_terms_and_sums_are_the_formulas(field: BakedField, stage: Stage) -> Non
     J = np.concatenate([np.cross(a, q), q], axis=-1)  # of both residuals, n x 6
     W = w * np.array([[1], [weight]]) / (scales[:, None] * (1 + square)) ** 2
     H, b = np.einsum("kna,kn,knb->ab", J, W, J), np.einsum("kna,kn,kn->a", J, W, r)
-    equations = normal_equations(terms, scales, weight)
-    for sums, expected in zip(equations, (H, b), strict=True):
+    for sums, expected in zip(normal_equations(terms, scales, weight), (H, b), strict=True):
         np.testing.assert_allclose(sums, expected, atol=1e-5 * abs(H).max())
     turn = R @ START[:3, :3].T
     sines = (turn - turn.T)[[2, 0, 1], [1, 2, 0]] / 2
@@ -126,10 +125,11 @@ def test_a_pose_is_held_where_it_cannot_slide_far(free_m: float, low: float, hig
     assert stds[0] == stds[1]
 
 
-@pytest.mark.parametrize(
-    ("scene", "low", "high"),
-    [("wall", 0.01, 1), ("floor", 0.2, 1), ("corridor", 0.2, 1), ("corner", 0, 0.01)],
-)
+# Least and largest standard deviations (m) in a scene of planes.
+STDS = [("wall", 0.01, 1), ("floor", 0.2, 1), ("corridor", 0.2, 1), ("corner", 0, 0.01)]
+
+
+@pytest.mark.parametrize(("scene", "low", "high"), STDS)
 def test_ripples_of_a_map_hold_nothing(scene: str, low: float, high: float) -> None:
     """Catches a standard deviation of centimetres where only the noise of the map's colours has a
     slope along what is seen; and doubts where three planes hold the camera."""
@@ -162,8 +162,7 @@ def test_a_pose_between_steps_of_colour_is_not_held_along_a_corridor() -> None:
     points = plane_depths(planes, rays)[:, None] * rays
     at_edge = np.abs(np.sin(np.pi * points[:, 2] / 0.2))
     points = points[(at_edge > 0.9) & (points[:, 2] < 1.6) & (points[:, 2] > 0.4)][:400]
-    luma = 0.5 + 0.3 * np.sign(np.sin(np.pi * points[:, 2] / 0.2))
-    seen = Observed(points, luma, NONE)
+    seen = Observed(points, 0.5 + 0.3 * np.sign(np.sin(np.pi * points[:, 2] / 0.2)), NONE)
     optimizer = LmOptimizer(grid_of(BakedField(surface, 0.025)), seen, seen, 1.0, ORIGIN)
     optimizer.run()
     # As the prior alone has it: 0.5 m, of which scales are two.
@@ -249,8 +248,7 @@ def test_points_are_drawn_away_from_borders_and_edges() -> None:
     columns, rows = (points[:, :2] / points[:, 2:] * 24 + [16, 12] - 0.5).T.round().astype(int)
     assert {*columns} == {*range(1, 15), *range(17, 31)}
     assert {*rows} == {1, *range(7, 23)}
-    color = frame.color[rows, columns].numpy() / 255
-    np.testing.assert_allclose(luma, color @ LUMA, atol=1e-6)
+    np.testing.assert_allclose(luma, frame.color[rows, columns].numpy() / 255 @ LUMA, atol=1e-6)
     assert len(draw_points(walk(1)[0], 400, torch.Generator())[0]) == 400
 
 

@@ -11,25 +11,16 @@ import pytest
 import torch
 from box_room import BoxRoom, box_sequence, poses_at, walk
 
+from nbtrack import Frame, Tracker, make_tracker
 from nbtrack.beyond.grid import BakedField
-from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, field_class
 from nbtrack.machinery.errors import ConfigError, DataError, NumericalError
 from nbtrack.mapping.fit import map_sequence
-from nbtrack.tracking import (
-    ClockBudget,
-    SdfSettings,
-    StepBudget,
-    Tracker,
-    TrackerSettings,
-    Trajectory,
-    VrSettings,
-    make_tracker,
-    track_sequence,
-    tracker_class,
-)
+from nbtrack.tracking import ClockBudget, StepBudget, TrackerSettings, Trajectory, tracker_class
+from nbtrack.tracking.paper import SdfSettings, VrSettings
 from nbtrack.tracking.starts import expected_poses, rigid
+from nbtrack.tracking.trajectories import track_sequence
 
 SETTINGS = {"vr": VrSettings(n_pixels=128), "sdf": SdfSettings(n_pixels=256, lambda_color=0.1)}
 
@@ -273,8 +264,7 @@ def digest_of(tracker: str, seed: int) -> str:
     network = NetworkSettings(width=24, n_frequencies=16)
     field = map_sequence(PAIRS[tracker], sequence, network, mapping, seed).field
     settings = tracker_class(tracker).Settings(n_pixels=64, motion_model="better_of_both")
-    T_first = sequence.T_world_camera[0]
-    run = make_tracker(tracker, field, T_first, StepBudget(3.5), settings, seed)
+    run = make_tracker(tracker, field, sequence.T_world_camera[0], StepBudget(3.5), settings, seed)
     found = hashlib.sha256(track_sequence(run, sequence).T_estimated.tobytes())
     for name, tensor in field.state_dict().items():
         found.update(name.encode() + tensor.numpy().tobytes())
