@@ -59,9 +59,10 @@ def test_standing_still_by_hand() -> None:
     assert still_metrics(true[:1]) == {}
 
 
-@pytest.mark.parametrize(
-    "true", [wandering(20), poses_at([[1, 2, 3]] * 5), poses_at([[1, 2, 3]] * 2)]
-)
+TRUE = [wandering(20), poses_at([[1, 2, 3]] * 5), poses_at([[1, 2, 3]] * 2)]
+
+
+@pytest.mark.parametrize("true", TRUE)
 def test_an_offset_counts_unless_aligned(true: np.ndarray) -> None:
     """Catches an alignment that slipped into the paper's formula, and NaN where nothing moves."""
     estimated = true.copy()

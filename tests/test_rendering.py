@@ -137,15 +137,15 @@ def test_stratified_samples(generator: torch.Generator) -> None:
     assert offsets.std().item() == pytest.approx(1 / math.sqrt(12), abs=0.03)
 
 
-@pytest.mark.parametrize(
-    ("weights", "expected"),
-    [
-        ([0.0, 1.0, 0.0], [1.625, 1.875, 2.125, 2.375]),  # levels 1/8, 3/8, 5/8, 7/8 of [1.5, 2.5]
-        ([1.0, 0.0, 1.0], [1.125, 1.375, 2.625, 2.875]),  # half in [1, 1.5], half in [2.5, 3]
-        # Nothing seen: a third of the samples in each cell, though the end cells are half as long.
-        ([0.0, 0.0, 0.0], [1.1875, 1.625, 2.375, 2.8125]),
-    ],
-)
+CELLS = [
+    ([0.0, 1.0, 0.0], [1.625, 1.875, 2.125, 2.375]),  # levels 1/8, 3/8, 5/8, 7/8 of [1.5, 2.5]
+    ([1.0, 0.0, 1.0], [1.125, 1.375, 2.625, 2.875]),  # half in [1, 1.5], half in [2.5, 3]
+    # Nothing seen: a third of the samples in each cell, though the end cells are half as long.
+    ([0.0, 0.0, 0.0], [1.1875, 1.625, 2.375, 2.8125]),
+]
+
+
+@pytest.mark.parametrize(("weights", "expected"), CELLS)
 def test_importance_depths_by_hand(weights, expected) -> None:
     """Catches cells that are off by one, and 0/0 for a ray without weight."""
     found = importance_depths(torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([weights]), 4)

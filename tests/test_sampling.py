@@ -21,12 +21,6 @@ BOX = SceneBounds((-3.0, -3.0, -3.0), (3.0, 3.0, 3.0))
 CONFIG = NeusMapping(n_stratified=16, n_surface=8, surface_band=0.15)
 
 
-def wall(signed: bool) -> Formula:
-    """A gray wall at z = 2, either dense behind it or as a signed distance."""
-    signed_distance, density = lambda p: 2.0 - p[:, 2], lambda p: 50.0 * (p[:, 2] > 2)
-    return Formula(signed_distance if signed else density, BOX, as_density=not signed)
-
-
 def random_sequence(n_frames: int):
     rng = np.random.default_rng(0)
     shape = (n_frames, CAMERA.height, CAMERA.width)
@@ -123,10 +117,13 @@ def test_hierarchical_find_the_wall(signed: bool, seeded: bool) -> None:
     """Catches a second pass beside the surface: the sections' weights lie between the samples; and
     where every sample is asked for once, answers sorted unlike their depths, and other draws.
 
-    The first pass leaves 9 cm between its samples; 12 of the second must be around the wall.
+    A gray wall at z = 2 is either dense behind it or a signed distance. The first pass leaves 9 cm
+    between its samples; 12 of the second must be around the wall.
     """
-    field, rays = wall(signed), rays_ahead(20, torch.zeros(20))
-    rays = replace(rays, origins_world=rays.origins_world.clone().requires_grad_())
+    distance, density = lambda p: 2.0 - p[:, 2], lambda p: 50.0 * (p[:, 2] > 2)
+    field = Formula(distance if signed else density, BOX, as_density=not signed)
+    origins = torch.zeros(20, 3, requires_grad=True)
+    rays = replace(rays_ahead(20, torch.zeros(20)), origins_world=origins)
     again = [torch.Generator().manual_seed(1) if seeded else None for _ in range(2)]
     depths = field.render_hierarchically(rays, 32, 12, again[0]).depths
     assert depths.shape == (20, 44)
