@@ -7,10 +7,12 @@ from torch import Tensor
 
 from nbtrack.core.bounds import SceneBounds
 from nbtrack.core.camera import Intrinsics, pixel_directions
+from nbtrack.data.frame import Frame
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields.base import LearnedField
 from nbtrack.fields.rendering import weights_from_density, weights_from_sdf
 from nbtrack.synthetic import build_room, handheld_trajectory, render_frame, room_intrinsics
+from nbtrack.tracking.tracker import Estimate
 
 SHIFT = 0.03  # m behind the wall at which the density is half its largest
 
@@ -114,6 +116,11 @@ def walk(n_frames: int, *room_and_height: BoxRoom | int) -> RgbdSequence:
 def narrow_room() -> BoxRoom:
     """One of which the camera sees five walls: they hold its pose without their colours."""
     return BoxRoom(half=(0.6, 0.45, 1.2))
+
+
+def error_m(found: Estimate, frame: Frame) -> float:
+    """How far the estimate is from where the frame was taken."""
+    return float(np.linalg.norm(found.T_world_camera[:3, 3] - frame.T_world_camera[:3, 3]))
 
 
 PLANES = {  # how far (m) they lie in a direction; and whether they hold a camera without colours

@@ -96,10 +96,6 @@ def short(b: float) -> Change:
     return depth(lambda true_mm: (np.sqrt(1 + 4 * b * true_mm / 1000) - 1) / (2 * b / 1000))
 
 
-def color(change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    return lambda data: data._replace(colors=change(data.colors))
-
-
 def camera(f: float, c: float = 1.0) -> Change:
     """Focal lengths and principal point times a factor each."""
 
@@ -202,8 +198,7 @@ def write_tum(folder: Path, data: Source) -> None:
             write_image(folder / file, image)
             lists[name].append(f"{time + late:.6f} {file}")
     # 0.025 s from each other, and from the next frame: too far to belong together.
-    odd = (("rgb", data.colors[0], 0.05), ("depth", data.depths_mm[0], 0.075))
-    for name, image, late in odd:
+    for name, image, late in (("rgb", data.colors[0], 0.05), ("depth", data.depths_mm[0], 0.075)):
         write_image(folder / name / "odd.png", image)
         lists[name].append(f"{times[1] + late:.6f} {name}/odd.png")
     for name, lines in lists.items():
@@ -233,8 +228,7 @@ def write_seven_scenes(folder: Path, data: Source) -> None:
     names = "frame-{:06}.color.png", "frame-{:06}.depth.png"
     write_images(folder, data._replace(depths_mm=raw), *names)
     for i, pose in enumerate(data.poses):
-        text = matrix_text(pose).replace(" ", "\t ")
-        (folder / f"frame-{i:06}.pose.txt").write_text(text)
+        (folder / f"frame-{i:06}.pose.txt").write_text(matrix_text(pose).replace(" ", "\t "))
 
 
 def write_scannet(folder: Path, data: Source) -> None:

@@ -84,9 +84,8 @@ def test_what_is_taken_from_the_source() -> None:
 def test_voxels_that_are_refused(voxel: float) -> None:
     """Catches a division by zero, memory taken before it is counted, and advice that is no help."""
     never = formula(lambda points: pytest.fail("sampled before the size was checked"))
-    with pytest.raises(
-        ConfigError, match=r"^voxel is .* m, of a .* m: .* may take .*; set "
-    ) as error:
+    says = r"^voxel is .* m, of a .* m: .* may take .*; set "
+    with pytest.raises(ConfigError, match=says) as error:
         BakedField(never, voxel)
     advice = float(str(error.value).split("; set voxel=")[1].split(" or")[0])
     n_x, n_y, n_z = grid.checked_size(never.bounds, advice)

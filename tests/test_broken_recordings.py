@@ -131,7 +131,6 @@ def test_files_of_the_system(tmp_path: Path) -> None:
     assert len(open_recording(folder)) == N_FRAMES
 
 
-EXAMPLES = int(os.environ.get("NBTRACK_FUZZ_EXAMPLES", "300"))
 WORDS = (
     "nan", "inf", "-inf", "1e400", "-1e308", "1e200", "1e7", "-0.5", "[" * 100_000,
     "1e-320", "0", "-0", "1", "1_0", "0x1p3", "٣", "½", "true", "null", "NaN", "1" * 400,
@@ -163,7 +162,7 @@ def nearly_as(original: str, random: Random) -> str:
 def test_only_our_own_errors(tmp_path: Path) -> None:
     """Catches any other exception or warning, and poses or pixels that are no numbers."""
     random = Random(0)
-    for number in range(EXAMPLES):
+    for number in range(int(os.environ.get("NBTRACK_FUZZ_EXAMPLES", "300"))):
         format = random.choice([*WRITERS])
         folder, texts = small_recording(format, tmp_path)
         path = random.choice(texts)

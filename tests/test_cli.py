@@ -31,7 +31,6 @@ from nbtrack.recordings.pose_files import read_tum
 from nbtrack.recordings.recording import open_recording
 
 TINY = tiny_words("scenes.n_frames=6", "tracking.sdf.n_pixels=32")
-TINY_MAP = ["--set", "network.neus.width=32", "--set", "mapping.neus.n_rays=48"]
 
 
 def track(path: Path | str, *more: str) -> list[str]:
@@ -122,11 +121,11 @@ def test_a_recording_without_poses_is_tracked_in_a_map(work: Path, capsys, monke
     an earlier run that stays beside a trajectory without one."""
     monkeypatch.setattr("nbtrack.beyond.correction._N_POINTS", 20_000)
     recording = work / "rec"
-    words = ["--set", "mapping.neus.iterations=200", "--set", "correction.neus=0.15"]
     made = ["data", "make", "office", "--out", str(recording), "--n-frames", "8", "--width", "64"]
     assert main(made) == 0
-    small = [*TINY_MAP, *words]
-    assert main(["map", str(recording), "--field", "neus", *small, "--out", "corrected"]) == 0
+    small = "network.neus.width=32", "mapping.neus.n_rays=48", "mapping.neus.iterations=200"
+    words = [word for text in (*small, "correction.neus=0.15") for word in ("--set", text)]
+    assert main(["map", str(recording), "--field", "neus", *words, "--out", "corrected"]) == 0
     capsys.readouterr()
     assert main(["track", str(recording), "--map-from", "corrected", "--out", "known"]) == 0
     assert "stands still" in capsys.readouterr().out
@@ -177,30 +176,21 @@ def test_a_pipe_that_nobody_reads() -> None:
     assert (found.returncode, found.stderr) == (1, "")
 
 
-@pytest.fixture
-def clock(monkeypatch) -> SimpleNamespace:
-    """That of the bars, in seconds, moved by hand."""
-    clock = SimpleNamespace(now=0.0)
-    monkeypatch.setattr("tqdm.std.time", lambda: clock.now)
-    return clock
-
-
-def test_a_line_now_and_then(clock, capsys) -> None:
+def test_a_line_now_and_then(capsys, monkeypatch) -> None:
     """Catches output that is silent until the end, or never, and an ETA that is not from the mean
-    speed: 2 of 8 parts in 31 seconds leave 93."""
+    speed: 2 of 8 parts in 31 seconds leave 93; and hours that are left for half an hour, because
+    the first frame was compiled."""
+    clock = SimpleNamespace(now=0.0)  # s, moved by hand
+    monkeypatch.setattr("tqdm.std.time", lambda: clock.now)
     with ProgressBar("mapping", 8) as bar:
         for clock.now, done in ((31, 2), (40, 3), (90, 8)):
             bar.move_to(done, "loss 0.5")
     first, *others = capsys.readouterr().err.splitlines()
     assert first == "mapping: 25 %, 00:31 gone, 01:33 left, loss 0.5"
     assert {*others} == {"mapping: 100 %, 01:30 gone, 00:00 left, loss 0.5"}
-
-
-def test_a_slow_start_is_forgotten(clock, capsys) -> None:
-    """Catches hours that are left for half an hour, because the first frame was compiled."""
     with ProgressBar("tracking", 60) as bar:
         for frame in range(50):
-            clock.now = 600 + 31 * frame
+            clock.now += 31 if frame else 600
             bar.move_to(frame + 1)
     *_, last, _ = capsys.readouterr().err.splitlines()
     assert "05:10 left" in last  # 10 times 31 s

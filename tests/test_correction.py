@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from box_room import BoxRoom, Formula, box_sequence, poses_at
+from box_room import BoxRoom, Formula, box_sequence, error_m, poses_at
 
-from nbtrack import Frame, Map, read_map, write_map
+from nbtrack import Map, read_map, write_map
 from nbtrack.beyond.correction import CORRECTIONS, CorrectedField, correct_map, corrected
 from nbtrack.beyond.grid import BakedField
 from nbtrack.beyond.least_squares import corrected_vertices, regularisation_of, solve
@@ -18,7 +18,6 @@ from nbtrack.data.sequence import RgbdSequence
 from nbtrack.fields import NetworkSettings, NeusMapping, make_field
 from nbtrack.machinery.errors import DataError
 from nbtrack.tracking import StepBudget
-from nbtrack.tracking.tracker import Estimate
 
 ROOM, VOXEL = BoxRoom(half=(1.0, 0.5, 1.2)), 0.05
 
@@ -143,10 +142,6 @@ def test_a_file_keeps_it_whole(tmp_path: Path, sequence: RgbdSequence) -> None:
 
 def tracked(field: CorrectedField, T_start: np.ndarray) -> LmTracker:
     return LmTracker(field, T_start, StepBudget(30), LmSettings(n_pixels=1024))
-
-
-def error_m(found: Estimate, frame: Frame) -> float:
-    return float(np.linalg.norm(found.T_world_camera[:3, 3] - frame.T_world_camera[:3, 3]))
 
 
 def test_a_kidnapped_camera_is_found(found: CorrectedField, sequence: RgbdSequence) -> None:

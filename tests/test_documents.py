@@ -30,10 +30,7 @@ def test_tables_are_those_of_the_files() -> None:
     assert all(f"<!-- table: {name} -->" in "".join(texts) for name in documents.TABLES)
 
 
-WITH_TABLE = [name for name, grid in evidence.GRIDS.items() if grid.has_table]
-
-
-@pytest.mark.parametrize("name", WITH_TABLE)
+@pytest.mark.parametrize("name", [n for n, grid in evidence.GRIDS.items() if grid.has_table])
 def test_committed_tables_are_those_of_their_runs(name: str, tmp_path: Path) -> None:
     """Catches a table of two sensors or paths, and a caption that the code no longer writes."""
     committed, folder = documents.PROJECT / "paper_tables" / name, tmp_path / name

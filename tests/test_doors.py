@@ -306,13 +306,3 @@ def test_what_could_not_be_read_is_not_written(case: str, tmp_path: Path, monkey
     write_map(tmp_path, read_map(tmp_path / "alone"))
     assert read_map(tmp_path).history.empty
     assert not (tmp_path / "mesh.ply").exists()
-
-
-def test_frames_are_lost_by_one_rule() -> None:
-    """Catches a frame without depth that is lost as an estimate, and neither lost nor found in
-    the table."""
-    seen = replace(SEQUENCE, depths_mm=SEQUENCE.depths_mm.copy())
-    seen.depths_mm[2] = 0
-    mine = tracker()
-    mine.report = lambda: {"lost": False}
-    assert track_sequence(mine, seen).frames["lost"].tolist() == [False, True, False]

@@ -31,9 +31,8 @@ def assert_refused(work: Path, capsys, command: list[str], says: str) -> str:
     capsys.readouterr()
     assert main(command) == 2
     lines = capsys.readouterr().err.splitlines()
-    (error,) = [
-        line for line in lines if not line.startswith(("nbtrack: warning: ", "nbtrack: note: "))
-    ]
+    beside = "nbtrack: warning: ", "nbtrack: note: "
+    (error,) = [line for line in lines if not line.startswith(beside)]
     assert error.startswith("nbtrack: "), error
     assert says in error
     assert contents(work) == before
@@ -95,7 +94,6 @@ TOML = {
 }
 KITTI = ["export", "run", "--to", "kitti", "poses.txt"]
 MESH = ["export", "map", "--to", "glb", "m.glb"]
-MAKE = ["data", "make", "office", "--out", "new"]
 COMMANDS = {"OWN": OWN, "GIVEN": GIVEN, "MAP": MAP}
 CUT = "not a readable checkpoint"
 TRAJECTORY, MAP_FILE, RUN = "run/trajectory.txt", "map/map.safetensors", "run/metrics.json"
@@ -103,8 +101,9 @@ ROW = "0.1 1 2 3 0 0 0 1"
 RUN_OF_WORDS = {"estimates": "here", "rows": [], "tracker": {}, "budget": {}}
 KILLED_MAP = "maps", "map.safetensors", "mapping.pt"
 KILLED_RUN = "tracks", "metrics.json", "run.pt"
-# Results that were spoilt. What a map file may hold instead of a map: test_map_files.py.
-FILES = {
+# What is spoilt, the command, and what it says. Spoilt results come first. What a map file may hold
+# instead of a map: test_map_files.py.
+FAULTS: dict[str, tuple[Callable[[], object], list[str], str]] = {
     "no map": (_nothing, [*GIVEN, "nowhere"], "nowhere holds no finished map"),
     "a run for a map": (_nothing, [*GIVEN, "run"], "run holds no finished"),
     "another file for a map": (_nothing, [*GIVEN, RUN], "map again, and give"),
@@ -126,8 +125,6 @@ FILES = {
     "a text for an origin": (_put("origin", "000"), KITTI, "metrics.json is '000'"),
     "other columns": (_write("run/frames.csv", "a\n" + 4 * "1\n"), KITTI, "run is not a readable"),
 }
-Fault = tuple[Callable[[], object], list[str], str]  # what is spoilt, the command, what it says
-FAULTS: dict[str, Fault] = {**FILES}
 for case, (content, says) in TOML.items():
     command = [*MAP, "--config", "settings.toml"]
     FAULTS[f"config file: {case}"] = (_write("settings.toml", content), command, says)
@@ -168,7 +165,8 @@ def test_a_disk_that_fills_up_while_results_are_written(n_bytes: int, work: Path
     requested and 36864 written", which names no cause and no folder."""
     commands = [([*OWN, "--seed", "0", "--frames", "1:"], "run")]
     if n_bytes < 1000:
-        commands.append(([*MAKE, "--n-frames", "2", "--width", "64"], "new"))
+        make = "data make office --out new --n-frames 2 --width 64"
+        commands.append((make.split(), "new"))
     if n_bytes == 0:
         commands += [(["export", "map", "--to", "ply", "new"], "new"), (KITTI, "poses.txt")]
     with files_limited_to(n_bytes):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from box_room import box_sequence, narrow_room, walk
+from box_room import box_sequence, error_m, narrow_room, walk
 
 from nbtrack.beyond.lm import LmSettings
 from nbtrack.core.camera import Intrinsics
@@ -14,10 +14,6 @@ from nbtrack.tracking import StepBudget, make_tracker
 SETTINGS = LmSettings(n_restarts=2)
 CAMERA_OF_BUFFERS = Intrinsics.from_focal(16, 12, 14.0)
 Images = tuple[np.ndarray, np.ndarray]
-
-
-def error_m(found: np.ndarray, sequence, index: int) -> float:
-    return float(np.linalg.norm(found[:3, 3] - sequence.T_world_camera[index, :3, 3]))
 
 
 def test_units_and_types_are_what_they_say() -> None:
@@ -80,9 +76,9 @@ def test_a_spoilt_frame_is_survived_and_flagged(case: str) -> None:
         assert np.isfinite(estimate.T_world_camera).all()
         if turn == 2:
             assert must_flag is None or estimate.lost is must_flag
-            assert estimate.lost or error_m(estimate.T_world_camera, sequence, index) < LOST
+            assert estimate.lost or error_m(estimate, sequence[index]) < LOST
     assert not estimate.lost
-    assert error_m(estimate.T_world_camera, sequence, index) < 0.01
+    assert error_m(estimate, sequence[index]) < 0.01
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -138,7 +138,7 @@ def test_box_by_hand(generator: torch.Generator) -> None:
     beyond = torch.maximum(low - exits, exits - high).amax(dim=-1)
     torch.testing.assert_close(beyond, torch.zeros(500), rtol=0, atol=1e-5)
     along = torch.tensor([[0.0, -0.0, 1.0], [1e-12, 0.0, -2.0], [0.0, 0.0, 1.0]])
-    starts = torch.tensor([[1.0, 0.0, 3.0], [1.0, 0.0, 3.0], [1.0, 0.0, 9.0]])
+    starts = torch.tensor([[0.0, 0.0, 3.0], [1.0, 0.0, 3.0], [1.0, 0.0, 9.0]])
     assert box.far_bound(starts, along).tolist() == pytest.approx([2.0, 0.5, -4.0])
 
 

@@ -125,8 +125,7 @@ CPU = torch.device("cpu")
 
 def tracked(kind: type, field_name: str, device: torch.device = CPU) -> np.ndarray:
     field = make_field(field_name, NetworkSettings(width=16), BOUNDS, seed=3).to(device)
-    settings = kind.Settings(n_pixels=24)
-    tracker = kind(field, SEQUENCE.T_world_camera[0], StepBudget(4), settings)
+    tracker = kind(field, SEQUENCE.T_world_camera[0], StepBudget(4), kind.Settings(n_pixels=24))
     return track_sequence(tracker, SEQUENCE).T_estimated
 
 

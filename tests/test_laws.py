@@ -69,12 +69,11 @@ def test_the_trackers_losses_by_hand() -> None:
     wide = SceneBounds((-4.0, -4.0, -1.0), (4.0, 4.0, 3.0))
     ahead = torch.from_numpy(T_off[:3, 2]).float()  # of a camera that is turned
     wall = Formula(lambda points: 500.0 * (points @ ahead > 2.0), wide, as_density=True)
-    depth_mm = torch.full_like(frame.depth_mm, 2500)
     settings = VrSettings(n_pixels=200, lambda_color=0.0, lambda_depth=2.0, n_stratified=200)
     T_off[:3, 3] = 0
     tracker = make_tracker("vr", wall, T_off, StepBudget(1), settings)
     # Half a metre off, over the least deviation, 2 cm, of what is nearly a step.
-    seen = Frame(camera, frame.color, depth_mm, T_off)
+    seen = Frame(camera, frame.color, torch.full_like(frame.depth_mm, 2500), T_off)
     assert tracker.track(seen).loss == pytest.approx(2 * 0.5 / 0.02, rel=0.1)
 
 

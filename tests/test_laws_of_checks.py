@@ -27,9 +27,8 @@ OWN = Convention(
 def frames(**changes) -> pd.DataFrame:
     """Eight frames of which nothing is to be said."""
     usual = {"measured": 1.0, "brightness": 0.5, "depth_step": 1, "is_repeated": False}
-    return pd.DataFrame(
-        {**usual, "moved_mm": 30.0, "turned_deg": 0.3, "off_mm": 1.0, **changes}, range(8)
-    )
+    usual |= {"moved_mm": 30.0, "turned_deg": 0.3, "off_mm": 1.0}
+    return pd.DataFrame({**usual, **changes}, range(8))
 
 
 def test_a_value_that_many_pixels_share() -> None:
@@ -93,13 +92,13 @@ def test_what_depths_say() -> None:
     assert outliers.startswith("1.96% of the depths are outliers, 50 to 60 m away")
 
 
-@pytest.mark.parametrize(
-    ("apart", "depth_m", "overlap", "kind"),
-    [
-        (0.0054, 2.0, 0.5, []), (0.008, 2.0, 0.5, ["doubt"]), (0.012, 2.0, 0.5, ["fault"]),
-        (0.0024, 10.0, 0.5, []), (0.0026, 10.0, 0.5, ["fault"]), (0.008, 2.0, 0.1, []),
-    ],
-)  # fmt: skip
+APART = [
+    (0.0054, 2.0, 0.5, []), (0.008, 2.0, 0.5, ["doubt"]), (0.012, 2.0, 0.5, ["fault"]),
+    (0.0024, 10.0, 0.5, []), (0.0026, 10.0, 0.5, ["fault"]), (0.008, 2.0, 0.1, []),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("apart", "depth_m", "overlap", "kind"), APART)
 def test_how_far_apart_surfaces_may_lie(apart, depth_m, overlap, kind) -> None:
     """Catches another limit: 5.5 mm a metre, or 25 mm; and a fault from twice the former on."""
     own = replace(OWN, apart=apart, depth_m=depth_m, overlap=overlap)

@@ -167,8 +167,7 @@ def test_a_doubtful_pose_is_confirmed_or_others_are_tried() -> None:
 def test_hypotheses_stand_upright() -> None:
     """Catches random poses that are turned about another axis than the vertical, or about the
     camera's own: how far a camera is pitched does not change, only where it looks."""
-    known = poses_at(np.zeros((2, 3)), [[0.4, 0.0, 0.0], [-0.4, 0.0, 0.0]])
-    found = begun()._random_poses(known)
+    found = begun()._random_poses(poses_at(np.zeros((2, 3)), [[0.4, 0.0, 0.0], [-0.4, 0.0, 0.0]]))
     np.testing.assert_allclose(found[:, 1, 1], np.cos(0.4))
     for axis in (1, 2):  # down and ahead, to either side
         assert len(np.unique(np.sign(found[:, 0, axis]))) == 2

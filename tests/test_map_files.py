@@ -200,8 +200,7 @@ def test_frames_outside_of_what_was_mapped() -> None:
     """Catches a camera in a part that no map holds, without a word, and one that counts for a few
     points: the map ends at x = 0, and half of the frames look to where it is not, known by their
     true poses alone; of the others some see a little beyond its height."""
-    towards_x = np.outer([1] * 5 + [-1] * 5, [0, np.pi / 2, 0])
-    poses = poses_at(np.zeros((10, 3)), towards_x)
+    poses = poses_at(np.zeros((10, 3)), np.outer([1] * 5 + [-1] * 5, [0, np.pi / 2, 0]))
     half = BoxRoom(half=(1.5, 1.2, 2.0))
     half.bounds = SceneBounds((-1.6, -0.6, -2.1), (0.0, 0.6, 2.1))
     astray = np.tile(poses[9], (10, 1, 1))
@@ -237,7 +236,6 @@ def test_meshes_keep_their_colours(work: Path, source: str, kind: str) -> None:
     that is refused."""
     assert main(["export", source, "--to", kind, f"mesh.{kind}"]) == 0
     mesh = trimesh.load_mesh(f"mesh.{kind}", process=False)
-    mesh = mesh.to_mesh() if isinstance(mesh, trimesh.Scene) else mesh
     assert len(mesh.faces) > 10
     assert np.asarray(mesh.visual.vertex_colors)[:, :3].std(axis=0).max() > 1
     bounds = read_map("room").field.bounds
@@ -256,8 +254,7 @@ def test_up_is_up(up: list[int]) -> None:
     origin, found = np.array([500_000.0, 4_649_000.0, 0.0]), {}
     for kind, colors in (("ply", [10, 128, 255]), ("glb", [1, 55, 255])):
         content = trimesh.util.wrap_as_stream(mesh_bytes(mesh, kind, origin, up))
-        read = trimesh.load(content, file_type=kind, process=False)
-        read = read.to_mesh() if isinstance(read, trimesh.Scene) else read
+        read = trimesh.load_mesh(content, file_type=kind, process=False)
         assert (read.faces == mesh.faces).all()
         assert (np.asarray(read.visual.vertex_colors)[:, :3] == colors).all()
         found[kind] = np.asarray(read.vertices)

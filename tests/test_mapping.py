@@ -48,8 +48,7 @@ def finished_wall():
 def test_neus_finds_a_wall() -> None:
     """Catches wrong signs or units of the distance: 1.5 m before a wall it is 1.5 m off zero."""
     mapped = finished_wall()
-    ahead = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.7], [0.0, 0.0, 2.0]])
-    color, sdf = mapped.field(ahead)
+    color, sdf = mapped.field(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.7], [0.0, 0.0, 2.0]]))
     assert not sdf.requires_grad
     assert sdf[2].abs() < 0.05
     assert sdf[1] == pytest.approx(0.3, abs=0.1)

@@ -128,8 +128,7 @@ def test_poses_that_cannot_be_compared() -> None:
 
 def test_detection_of_lost_frames() -> None:
     """Catches precision taken for recall, and a share of nothing that passes for a number."""
-    errors = np.array([0.5, 0.5, 0.5, 0.01])
-    found = score_detection(np.array([True, False, False, False]), errors)
+    found = score_detection(np.array([True, False, False, False]), np.array([0.5, 0.5, 0.5, 0.01]))
     assert found == {"lost_precision": 1.0, "lost_recall": pytest.approx(1 / 3)}
     none = score_detection(np.array([False]), np.array([0.01]))
     assert none == {"lost_precision": None, "lost_recall": None}

@@ -76,8 +76,7 @@ def halfway(data):
     """Poses of two frames and a half later."""
     numbers = np.arange(len(data.poses))
     later, poses = (numbers + 2.5).clip(0, numbers[-1]), data.poses.copy()
-    turns = Slerp(numbers, Rotation.from_matrix(poses[:, :3, :3]))
-    poses[:, :3, :3] = turns(later).as_matrix()
+    poses[:, :3, :3] = Slerp(numbers, Rotation.from_matrix(poses[:, :3, :3]))(later).as_matrix()
     poses[:, :3, 3] = interp1d(numbers, poses[:, :3, 3], axis=0)(later)
     return data._replace(poses=poses)
 

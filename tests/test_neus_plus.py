@@ -82,8 +82,7 @@ def test_observed_distance_from_a_wall() -> None:
     observed = ObservedDistance(slanted_wall(4), np.arange(4), bounds, torch.device("cpu"))
     points = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.6], [0.0, 0.0, 3.0]])
     found, is_free = observed(points[None])
-    expected = torch.tensor([[0.707, 0.0, 0.99, 0.707]])
-    torch.testing.assert_close(found, expected, atol=0.04, rtol=0)
+    torch.testing.assert_close(found, torch.tensor([[0.707, 0.0, 0.99, 0.707]]), atol=0.04, rtol=0)
     assert is_free.tolist() == [[True, False, True, False]]
     assert torch.isfinite(observed(torch.full((1, 1, 3), -9.0))[0]).all()
 

@@ -75,15 +75,13 @@ def test_numbers_in_prose_are_computed(request, cells) -> None:
                 shown += f" {output.get('text')} {output.get('data', {}).get('text/plain')}"
     known = [float(text.replace(",", "")) for text in re.findall(r"\d[\d,]*(?:\.\d+)?", shown)]
     prose = "\n".join(cell["source"] for cell in cells if cell["cell_type"] == "markdown")
-    skipped = (
-        r"\*\*Time\.\*\*[^\n]*|\$\$.*?\$\$|\$.*?\$|`[^`]*`|\]\([^)]*\)|^#[^\n]*$|et al\. \d{4}"
-    )
+    other = r"\*\*Time\.\*\*[^\n]*|\$\$.*?\$\$|\$.*?\$|`[^`]*`|\]\([^)]*\)|^#[^\n]*$|et al\. \d{4}"
     rounded = {
         digits: {round(factor * number, digits) for number in known for factor in (1, 100, 1000)}
         for digits in range(4)
     }
     unknown = []
-    for text in re.findall(NUMBER, re.sub(skipped, "", prose, flags=re.S | re.M)):
+    for text in re.findall(NUMBER, re.sub(other, "", prose, flags=re.S | re.M)):
         is_shown = float(text.replace(",", "")) in rounded[len(text.partition(".")[2])]
         if not (len(text) == 1 or is_shown or text in FACTS):
             unknown.append(text)

@@ -94,8 +94,7 @@ def test_a_file_joins_by_an_option_of_every_command(tmp_path: Path, monkeypatch,
     assert "DISTANCE,8," in (tmp_path / "out/table_2.csv").read_text()
     (made,) = (tmp_path / "runs/maps").glob("office-fading-corrected-*")
     run = ["track", "office", "--map-from", str(made), "--steps", "1", "--out", "run", *words]
-    error = assert_refused(tmp_path, capsys, run, "'fading', which is not registered")
-    assert "--import" in error
+    assert "--import" in assert_refused(tmp_path, capsys, run, "'fading', which is not registered")
     with importing():
         assert main([*run, "--tracker", "distance", *own]) == 0
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())

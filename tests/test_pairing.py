@@ -53,9 +53,7 @@ REFUSED = pd.read_csv(Path(__file__).parent / "data/refused_names.csv", keep_def
 
 
 @pytest.mark.parametrize(("case", "colors", "depths", "says"), REFUSED.to_numpy())
-def test_names_that_are_refused(
-    plain: Path, case: str, colors: str, depths: str, says: str
-) -> None:
+def test_refused_names(plain: Path, case: str, colors: str, depths: str, says: str) -> None:
     """Catches images with their neighbours' depth where one of each is lost, two files of a number
     that shift all poses behind them, two sessions that are shuffled into one, and a recording that
     is shuffled in silence, since its names were sorted."""
@@ -68,10 +66,9 @@ def test_names_that_are_refused(
 @pytest.mark.parametrize("name", ["rgb.txt", "depth.txt", "groundtruth.txt", "timestamps.txt"])
 def test_times_that_tell_no_order(tmp_path: Path, name: str, times: np.ndarray) -> None:
     """Catches lists that are sorted by a clock that fell back, and rows of one time."""
-    is_list = name in ("rgb.txt", "depth.txt")
     folder = write_recording("tum" if name != "timestamps.txt" else "plain", tmp_path / "r")
     lines = [f"{time:.6f}" for time in times]
-    if is_list:
+    if name in ("rgb.txt", "depth.txt"):
         rows = (folder / name).read_text().splitlines()[1:]
         lines = [f"{t} {row.split()[1]}" for t, row in zip(lines, rows, strict=False)]
     elif name == "groundtruth.txt":
@@ -150,9 +147,8 @@ def test_a_lost_frame_however_it_is_spelled(plain: Path, words: list[str]) -> No
 def test_times_of_images_settle_it(tmp_path: Path) -> None:
     """Catches advice that does not help: where poses are refused, a file of times is enough, and
     an own trajectory of images that count from 1 is known by its times to the last digit."""
-    case = "from 1, cut, stamped"
     with pytest.raises(DataError, match=r"timestamps\.txt"):
-        listed(tmp_path / "r", case)
+        listed(tmp_path / "r", "from 1, cut, stamped")
     (tmp_path / "r/timestamps.txt").write_text(matrix_text(np.arange(4)[:, None] / 30))
     np.testing.assert_allclose(open_recording(tmp_path / "r").T_world_camera, source().poses[:4])
     times = listed(tmp_path / "own", "from 1").times

@@ -131,8 +131,7 @@ def test_curves_of_methods_and_sweeps() -> None:
     looks = [(line.get_label(), line.get_color(), line.get_marker()) for line in axes.lines]
     assert looks == [("VR", PALETTE[0], "o"), ("SDF", PALETTE[1], "s")]
     assert axes.collections[0].get_segments()[0][:, 1].tolist() == [0.5, 4.0]
-    variant = SWEEP.replace({"VR": "SDF, far"})
-    lines = plots.plot_curves(variant, *SWEEP).axes[0].lines
+    lines = plots.plot_curves(SWEEP.replace({"VR": "SDF, far"}), *SWEEP).axes[0].lines
     looks = [(line.get_color(), line.get_marker(), line.get_linestyle()) for line in lines]
     assert looks == [(PALETTE[1], "o", "--"), (PALETTE[1], "o", "-")]
     words = SWEEP.replace({"time (ms)": {1.0: "b", 9.0: "a"}})

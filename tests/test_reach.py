@@ -62,8 +62,7 @@ def test_the_greedy_follower_by_hand() -> None:
     """Catches a follower that overshoots, cuts a corner or looks at the wrong axis: with 2 mm of
     reach for 3 mm of motion it falls behind by 1 mm a frame; with 3 mm it never does."""
     path = straight(0.003)
-    followed = greedy_follower(path, 0.002)
-    assert_allclose(followed[:, 0, 3], 0.002 * np.arange(11), atol=1e-12)
+    assert_allclose(greedy_follower(path, 0.002)[:, 0, 3], 0.002 * np.arange(11), atol=1e-12)
     behind = 1e-3 * np.arange(1, 11)
     assert greedy_ate(path, 0.002) == pytest.approx(np.sqrt(np.mean(behind**2)))
     assert greedy_ate(path, 0.0031) == 0.0

@@ -244,8 +244,7 @@ CAPTIONS = pd.read_csv(Path(__file__).parent / "data/captions.csv")
 @pytest.mark.parametrize(("given", "written"), CAPTIONS.to_numpy())
 def test_captions_compile(tmp_path: Path, given: str, written: str) -> None:
     """Catches a caption or label that ends a line, a cell or TeX, and LaTeX that is spoiled."""
-    own = Wording(given, "tab:a_b%c#1")
-    first, *_ = write_tables(tmp_path, OURS_1, OURS_2, NOTE, wording=own)
+    first, *_ = write_tables(tmp_path, OURS_1, OURS_2, NOTE, wording=Wording(given, "tab:a_b%c#1"))
     text = first.with_suffix(".tex").read_text()
     assert rf"\caption{{{written} \textcolor{{red}}" in text
     assert r"\label{tab:a_b-c-1}" in text
@@ -303,10 +302,8 @@ def test_cells_of_no_table() -> None:
 
 def latex_is_installed() -> bool:
     files = ["booktabs.sty", "geometry.sty", "multirow.sty", "siunitx.sty", "xcolor.sty"]
-    has_programs = shutil.which("pdflatex") and shutil.which("kpsewhich")
-    return (
-        has_programs and not subprocess.run(["kpsewhich", *files], capture_output=True).returncode
-    )
+    has_both = shutil.which("pdflatex") and shutil.which("kpsewhich")
+    return has_both and not subprocess.run(["kpsewhich", *files], capture_output=True).returncode
 
 
 @pytest.mark.skipif(not latex_is_installed(), reason="no LaTeX with the packages needed")

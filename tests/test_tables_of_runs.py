@@ -249,8 +249,7 @@ def test_table_2_measures_own_settings(tmp_path: Path, scenes: list[Scene], monk
     assert isinstance(fields["icp"], PointCloud)
     assert isinstance(fields["lm"], CorrectedField)
     steps = pd.read_csv(tmp_path / "table_2.csv")
-    found = steps[["tracker", "n_pixels"]].to_numpy().tolist()
-    assert found == [["ICP", 8], ["LM", 8]]
+    assert steps[["tracker", "n_pixels"]].to_numpy().tolist() == [["ICP", 8], ["LM", 8]]
     assert "\\bfseries 8 " in (tmp_path / "table_2.tex").read_text()
 
 
@@ -279,8 +278,7 @@ def test_a_scene_whose_tracked_part_has_no_pose(cache: Path, tmp_path: Path, cap
     lost, whole = (write_recording("neural_rgbd", tmp_path / name) for name in ("lost", "whole"))
     rows = (lost / "poses.txt").read_text().splitlines()
     (lost / "poses.txt").write_text("\n".join([*(4 * ["nan nan nan nan"]), *rows[4:]]) + "\n")
-    names = f"scenes.names=['{lost}', '{whole}']"
-    words = tiny_words(names, "scenes.track_frames=:")
+    words = tiny_words(f"scenes.names=['{lost}', '{whole}']", "scenes.track_frames=:")
     command = ["tables", "--method", "sdf", "--workers", "1", "--out", str(tmp_path / "out")]
     assert main([*command, *words]) == 2
     assert "cells of the table failed" in capsys.readouterr().err
