@@ -76,15 +76,16 @@ def plot_pose_losses(
     straight = pose_losses(density, distance, frame)
     turned = pose_losses(density, distance, frame, y_deg)
     sdf_cm, vr_cm = turned[[_SDF_LOSS, _VR_LOSS]].idxmin()
-    title = f"Turned by {y_deg:g}°, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
+    title = f"Turned by {y_deg:g}° about y, SDF's loss is lowest at {sdf_cm} cm, VR's at {vr_cm} cm"
     panels = new_axes(title.replace("-", "−"), 2.9, 1, 2)[0]  # minus signs for hyphens
     for axes, (name, color) in zip(panels, _COLORS.items(), strict=True):
-        axes.plot(straight[name], color=color, alpha=0.4, label="pale: not turned")
+        axes.plot(straight[name], color=color, alpha=0.4, label="not turned")
         axes.plot(turned[name], color=color, label=f"turned by {y_deg:g}°")
         axes.plot(turned[name].idxmin(), turned[name].min(), "v", color="0.3", label="lowest")
         axes.axvline(0, label="the true pose", **DASHED)
-        axes.set(xlabel="camera off along x (cm)", ylabel=name)
-    return panels[0].figure.legend_below()
+        axes.set(xlabel="camera off along x (cm)", ylabel=name, ylim=0)
+        axes.legend(loc="upper left")
+    return panels[0].figure
 
 
 @styled

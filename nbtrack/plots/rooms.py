@@ -152,7 +152,7 @@ def plot_map_and_slice(
     for label in others:
         off_mm = 1000 * np.linalg.norm(paths[label] - paths[first], axis=1)
         right.plot(off_mm, color=method_colors(paths)[label])
-    right.set(xlabel="frame", ylabel="position error (mm)", ylim=(0, None))
+    right.set(title="error by frame", xlabel="frame", ylabel="position error (mm)", ylim=(0, None))
     return left.figure.legend_below(panel=1)
 
 
