@@ -41,7 +41,7 @@ def test_a_value_that_many_pixels_share() -> None:
     two = counts.copy()
     two[:, 7] = [1002, 3]
     assert findings.no_depth_values(two, frames()) == [7, 50]
-    still = frames(turned_deg=0.09)  # a surface may have one depth in all of its images
+    still = frames(turned_deg=0.04)  # a surface may have one depth in all of its images
     few, flat, seldom, rare = (counts.copy() for _ in range(4))
     few[0, 10:21], flat[0, 50], seldom[1, 50] = 0, 1000, 2
     rare[0, 100:], rare[0, 50] = 20, 1001
@@ -75,6 +75,22 @@ def test_poses_beside_the_path() -> None:
     assert "first img3.png" in odd
     for quiet in (frames(off_mm=off, moved_mm=90.0), frames(off_mm=49.0, moved_mm=1.0)):
         assert [*findings.of_poses(quiet, recording)] == []
+
+
+def test_poses_that_are_held() -> None:
+    """Catches poses of a slower source without a word, and a word about a camera that stands still
+    or turns, and about images that repeat, too."""
+    for held, changes in (
+        (6, {}),
+        (0, {}),
+        (8, {}),
+        (6, {"turned_deg": 0.3}),
+        (6, {"is_repeated": True}),
+    ):
+        table = frames(
+            **{"moved_mm": [0.0] * held + [30.0] * (8 - held), "turned_deg": 0.0, **changes}
+        )
+        assert len([*findings.of_held_poses(table)]) == (held == 6 and not changes)
 
 
 def test_what_depths_say() -> None:
@@ -202,7 +218,7 @@ def test_doubts_of_poses() -> None:
 
     other = replace(OWN, name="other")
     (alike,) = doubts(True, OWN, other)
-    assert "tell 1 other conventions apart, such as other" in alike
+    assert "1 other conventions fit about as well, such as other" in alike
     assert doubts(False, OWN, other) == []
     clear, depth = replace(other, agreement=0.3), replace(other, subject="depth")
     assert doubts(True, OWN, clear, depth) == []

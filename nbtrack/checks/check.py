@@ -130,7 +130,7 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     if best is declared:  # otherwise the numbers of poses and depths mean nothing
         faults += findings.of_poses(frames, recording) if "fault" not in misread else []
         doubts += findings.of_units(cloud.depth[~is_far])
-        remarks += findings.of_depths(cloud.depth)
+        remarks += [*findings.of_depths(cloud.depth), *findings.of_held_poses(frames)]
     if not (faults or doubts):
         doubts = list(findings.doubts_of_poses(conventions, recording, is_whole, frames))
     return DataReport(

@@ -20,6 +20,7 @@ _OFF = 0.05  # m
 _OFF_STEPS = 2.5  # medians of the distance between frames
 # It is a fault if a larger share of the depth images repeats the one before.
 _MIN_REPEATED = 0.05
+_MAX_HELD = 0.9  # where more poses repeat the one before, the camera stands still (our choice)
 _MAX_STEP = 0.01  # share of the depth: coarser steps of a camera's depth are remarked (our choice)
 # Coarse steps of depth explain a gap below this share of a step. In right recordings with such
 # steps surfaces lie 0.13 to 0.19 of a step apart.
@@ -32,7 +33,7 @@ SHARED, _SHARING, _SPIKE = 0.01, 0.25, 10
 # is wrong at edges, six numbers leave 0.44 or more; of a camera beside its poses 0.06 (our choice).
 _MAX_COST_OF_SEVERAL = 0.4
 # Of a camera that turns less (degrees a frame), a surface may have one depth in all images.
-_TURNS_DEG = 0.1
+_TURNS_DEG = 0.05
 _VALUES = 3  # a camera has at most so many values for no measurement (our choice)
 _FEW_VALUES = 10  # images of at most so many different depths do not tell (our choice)
 _BLACK = 0.02  # images are black if their median brightness, in [0, 1], is below this
@@ -105,8 +106,8 @@ def doubts_of_poses(
     """A doubt if it cannot be told whether the poses are read rightly.
 
     It cannot be told if two frames see too little of the same. With `needs_proof` it cannot be told
-    either if the camera moves too little to tell conventions apart. The declared convention must
-    come first in `conventions`. `frames` is the table of `check`.
+    either if other conventions fit about as well. The declared convention must come first in
+    `conventions`. `frames` is the table of `check`.
     """
     declared, *others = conventions
     file, measured = recording.pose_file.name, frames.measured.mean()
@@ -119,9 +120,9 @@ def doubts_of_poses(
         reason += f"; the camera moves {moved_m:.2g} m a frame" if moved_m > 0 else ""
         yield f"{file} is not proved: {reason}: check it, and a piece with smaller steps"
     elif needs_proof and alike:
-        reason = "the camera moves too little, or surfaces lie too far apart, to tell "
-        reason += f"{len(alike)} other conventions apart"
-        yield f"{file} is not proved: {reason}, such as {alike[0]}"
+        reason = f"{len(alike)} other conventions fit about as well, such as {alike[0]}"
+        why = "the camera moves too little, or surfaces are flat or lie apart"
+        yield f"{file} is not proved: {reason}: {why}"
 
 
 def no_depth_values(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> list[int]:
@@ -184,6 +185,14 @@ def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
         found = f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path"
         advice = "check the poses there, or leave frames out with --frames of map and track"
         yield f"{found} of their neighbours, first {first}: {advice}"
+
+
+def of_held_poses(frames: pd.DataFrame) -> Iterator[str]:
+    """A remark if some poses repeat the one before: of a slower source they are held between."""
+    is_held = (frames.moved_mm == 0) & (frames.turned_deg < 1e-3) & ~frames.is_repeated
+    if _MIN_REPEATED < is_held.mean() < _MAX_HELD:
+        found = f"{is_held.mean():.0%} of the poses repeat the one before, though the images change"
+        yield f"{found}: if the camera moved, give each image the pose of its own time"
 
 
 def of_units(depth: pd.Series) -> Iterator[str]:
