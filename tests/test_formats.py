@@ -276,7 +276,8 @@ def test_a_lens_by_any_name(plain: Path) -> None:
     for words in (
         {"distortion": lens},
         {"distortion": None, "coeffs": lens},
-        {"coeffs": None, **named, "distortion_model": "rational_polynomial", "skew": 0},
+        {"coeffs": None, "D": lens},
+        {"D": None, **named, "distortion_model": "rational_polynomial", "skew": 0},
     ):
         recordings.change_camera(plain, **words)
         seen.append(read_sequence(plain).depths_mm)

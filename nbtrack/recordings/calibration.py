@@ -22,7 +22,8 @@ _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length
 _LARGEST = 1e6  # a larger number in a calibration is a mistake: no image is so many pixels wide
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
 # Names of entries in a camera's JSON file that have another name in this package.
-_OTHER_NAMES = {"w": "width", "h": "height", "coeffs": "distortion", "scale": "depth_scale"}
+_OTHER_NAMES = {"w": "width", "h": "height", "scale": "depth_scale"}
+_OTHER_NAMES |= {"coeffs": "distortion", "D": "distortion"}
 # The entries that are read, and how many numbers each may have.
 _COUNTS = dict.fromkeys(("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *_LENS), (1,))
 _COUNTS |= {"intrinsic_matrix": (9,), "distortion": (0, 4, 5, 8, 12, 14)}
@@ -109,8 +110,8 @@ def read_calibration(path: Path) -> Calibration:
 
     A JSON file holds an object; in Replica's files this is the value of `camera`. Its entries are
     fx, fy, cx, cy or Open3D's `intrinsic_matrix` (nine numbers column by column); if known, width
-    and height (or w and h); a lens as `distortion`, `coeffs` or k1 to k6, p1, p2; and `depth_scale`
-    or `scale`: depth values a metre, or, if below 1, metres a depth value.
+    and height (or w and h); a lens as `distortion`, `coeffs`, `D` or k1 to k6, p1, p2; and
+    `depth_scale` or `scale`: depth values a metre, or, if below 1, metres a depth value.
 
     Raises DataError if a number is missing or impossible, or if an entry tells of another lens or
     unit.
