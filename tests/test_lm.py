@@ -56,6 +56,15 @@ def test_every_start_in_the_basin_reaches_the_true_pose(seed: int) -> None:
     assert errors(tracker)[1] < 0.05
 
 
+def test_depth_with_rows_missing_is_searched_too() -> None:
+    """Catches a camera whose every pixel lacks a neighbour's depth, as if it saw nothing."""
+    depth_mm = FRAME.depth_mm.clone()
+    depth_mm[::2] = 0
+    tracker = begun()
+    assert not run(tracker, retract(T_TRUE, FAR / 10), 40, replace(FRAME, depth_mm=depth_mm))
+    assert errors(tracker)[0] < 0.005
+
+
 @pytest.mark.parametrize("twist", [np.zeros(6), FAR], ids=["near", "restarted"])
 def test_without_colour_no_picture_counts(twist: np.ndarray) -> None:
     """Catches intensities that choose between starts, stages or restarts, or that make a verdict,

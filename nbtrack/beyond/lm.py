@@ -127,6 +127,8 @@ class LmTracker(Tracker):
         self.best = None  # the descent whose pose is the estimate
         self.remaining_steps = iter(())  # none, unless the frame has enough points
         observed = draw_points(frame, self.settings.n_pixels, self.generator)
+        if len(observed.points) < _MIN_POINTS:  # as where every second row lacks depth
+            observed = draw_points(frame, self.settings.n_pixels, self.generator, np.inf)
         n_points = len(observed.points)
         self.is_converged = n_points < _MIN_POINTS
         if self.is_converged:
