@@ -88,6 +88,7 @@ REFUSED = {
     "part of a frame": lambda: SEQUENCE[1.5],
     "a frame for frames": lambda: SEQUENCE.select(3),
     "points of two": lambda: BoxRoom()(torch.zeros(5, 2)),
+    "points of numpy": lambda: BakedField(BoxRoom(), 0.5).channels(np.zeros((5, 3))),
     "a float depth": lambda: replace(SEQUENCE[1], depth_mm=SEQUENCE[1].depth_mm / 1000),
     "camera last": lambda: Frame.of_images(SEQUENCE.colors[0], SEQUENCE.depths_mm[0], CAMERA),
     "images for a frame": lambda: tracker().track(SEQUENCE.colors[0]),

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -19,6 +19,7 @@ from nbtrack.core.bounds import SceneBounds
 from nbtrack.fields.base import Field
 from nbtrack.machinery.device import constant, usual_modes
 from nbtrack.machinery.errors import ConfigError
+from nbtrack.machinery.inputs import check_array
 
 _POINTS_AT_ONCE = 65_536  # batch size when a field is sampled
 _MAX_BYTES = 500_000_000  # of a grid: 25 million vertices, sampled in some minutes (our choice)
@@ -87,10 +88,12 @@ class BakedField(Field):
     def channels(self, points_world: Points) -> Float[Tensor, "5 points"]:
         """Red, green, blue, value and confidence at points (m, world frame); NaN at NaN.
 
-        The confidence says how well the surface is known, in [0, 1].
+        The confidence says how well the surface is known, in [0, 1]. Points may have any precision.
+        Raises DataError for anything but a tensor of shape (n, 3).
         """
+        check_array("points", points_world, ("n", 3), [Shaped], "in m", Tensor)
         volume = self.volume.view(5, *self.n_vertices)
-        values = trilinear(volume, self.low, self.voxel, points_world)
+        values = trilinear(volume, self.low, self.voxel, points_world.float())
         # At a position that is NaN, `trilinear` returns values of the border.
         return torch.where(points_world.isnan().any(dim=1), torch.nan, values)
 
