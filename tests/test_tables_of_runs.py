@@ -287,6 +287,7 @@ def test_a_scene_whose_tracked_part_has_no_pose(cache: Path, tmp_path: Path, cap
     assert errors.isna().loc["NeuS with SDF", "lost"].all()
     (damaged,) = cache.glob("maps/lost-*/map.safetensors")
     damaged.write_bytes(b"")
+    (tmp_path / "out/table_2.csv").unlink()
     assert main([*command, *words]) == 2
     assert "map.safetensors is not a readable map file" in capsys.readouterr().err
     assert len(pd.read_csv(tmp_path / "out/table_2.csv")) == 1
