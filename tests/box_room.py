@@ -109,8 +109,7 @@ def room_sequence(name: str, width: int, n_frames: int, stride: int = 1) -> Rgbd
 
 def walk(n_frames: int, *room_and_height: BoxRoom | int) -> RgbdSequence:
     """A camera that moves by 4 mm a frame."""
-    offsets = [[0.0036 * i, 0.0, 0.0018 * i] for i in range(n_frames)]
-    return box_sequence(offsets, *room_and_height)
+    return box_sequence([[0.0036 * i, 0.0, 0.0018 * i] for i in range(n_frames)], *room_and_height)
 
 
 def narrow_room() -> BoxRoom:

@@ -22,10 +22,9 @@ class FakeClock:
         count = 0
         self.seconds += 10.0  # what the next image takes to load is free
         frame = self.budget.frame()
-        for step in frame:
-            assert step == count
+        for count, step in enumerate(frame, start=1):
+            assert step == count - 1
             self.seconds += durations[min(step, len(durations) - 1)]
-            count += 1
             if count == last:
                 break
         frame.close()

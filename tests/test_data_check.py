@@ -168,8 +168,7 @@ def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:
 
 def test_no_memory_is_told_in_a_line(box: Path, capsys, monkeypatch) -> None:
     """Catches a traceback, and no word of what would help."""
-    full = mock.Mock(side_effect=MemoryError)
-    monkeypatch.setattr("nbtrack.recordings.reading.np.empty", full)
+    monkeypatch.setattr("nbtrack.recordings.reading.np.empty", mock.Mock(side_effect=MemoryError))
     assert main(["data", "convert", str(box), str(box.parent / "new")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "--frames ::2" in line
@@ -365,7 +364,6 @@ def test_black_images(tmp_path: Path) -> None:
     assert (report.frames.measured < 1).all()
     assert (report.cloud.depth > 0).all()
     (advice,) = (text for text in report.warnings if "images are black" in text)
-    settings = re.findall(r"tracking\.\w+\.\w+=0", advice)
-    changed = with_settings(load_preset("smoke"), *settings)
+    changed = with_settings(load_preset("smoke"), *re.findall(r"tracking\.\w+\.\w+=0", advice))
     assert changed.tracking_of("lm").lambda_intensity == 0
     assert changed.tracking_of("sdf").lambda_color == 0

@@ -110,8 +110,7 @@ def test_pixels_by_hand() -> None:
     direction = pixel_directions(camera, torch.tensor(320), torch.tensor(239))
     torch.testing.assert_close(direction, torch.tensor([0.001, -0.001, 1.0]))
     corner = backproject(camera, torch.tensor([0]), torch.tensor([0]), torch.tensor([2.0]))
-    expected = torch.tensor([[2 * -319.5 / 500, 2 * -239.5 / 500, 2.0]])
-    torch.testing.assert_close(corner, expected)
+    torch.testing.assert_close(corner, torch.tensor([[2 * -319.5 / 500, 2 * -239.5 / 500, 2.0]]))
 
 
 def test_project_undoes_backproject(shape: tuple[int, ...], generator: torch.Generator) -> None:

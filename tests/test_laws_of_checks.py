@@ -133,8 +133,7 @@ def test_a_cause_is_named() -> None:
     assert kinds == [["note"], ["fault"]]
     (text,) = findings.misreading(own, own, [replace(usual, apart=0.006)])["doubt"]
     assert "nothing that is tried" in text
-    better = replace(OWN, name="other", agreement=0.8)
-    assert [*findings.misreading(own, better, [])] == ["fault"]
+    assert [*findings.misreading(own, replace(OWN, name="other", agreement=0.8), [])] == ["fault"]
     for left, low, is_significant in ((0.8, 0.002, True), (0.95, 0.002, False), (0.8, 4e-4, False)):
         one = replace(usual, cost_left=left, numbers={"depth_error_per_m": (0.003, low, 0.004)})
         assert one.is_significant is is_significant
@@ -312,8 +311,7 @@ def test_what_is_hidden_or_late() -> None:
     """Catches points that count although a surface before them hides them; and depth that comes
     before the poses, or is not interpolated: of 21 frames, each 2.5 cm ahead."""
     assert wall_from(0.2).compare(READING).overlap == 0
-    long = wall_from(0.5, 21)
     for late in (0.0, 1.0, 0.5):
         # The first frame cannot be later: only the last one's pose is then too far ahead.
-        found = long.compare(replace(READING, late=late))
+        found = wall_from(0.5, 21).compare(replace(READING, late=late))
         assert found.apart == pytest.approx(0.025 * late / 1.5, abs=1e-4)

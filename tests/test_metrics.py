@@ -93,9 +93,8 @@ def test_another_world_is_told_from_errors() -> None:
     """Catches a recording in a world of its own whose frames all count as wrong; and errors that
     are explained away: of a camera that drifts, or of one that is right."""
     true, moved = wandering(40), wandering(1, seed=3)[0]
-    noise = np.random.default_rng(5).normal(scale=0.01, size=(40, 3))
     estimated = moved @ true
-    estimated[:, :3, 3] += noise
+    estimated[:, :3, 3] += np.random.default_rng(5).normal(scale=0.01, size=(40, 3))
     estimated[::3] = wandering(14, seed=9)  # lost frames do not change the world
     np.testing.assert_allclose(other_world(estimated, true), moved, atol=0.02)
     partly_known = np.concatenate([true[:39], np.full((1, 4, 4), np.nan)])
@@ -163,8 +162,7 @@ def test_a_rotation_by_hand(tmp_path: Path) -> None:
     assert line.startswith("0.5 1.5 -2.0 0.25 0.0 0.0 0.7071067811865")
     expected = [0.5, 1.5, -2, 0.25, 0, 0, np.sqrt(0.5), np.sqrt(0.5)]
     np.testing.assert_allclose([float(word) for word in line.split(" ")], expected, atol=1e-15)
-    others = " # made elsewhere\n0.5\t1.5 -2 0.25 0 0 0.7071 0.7071\n\n"
-    (tmp_path / "other.txt").write_text(others)
+    (tmp_path / "other.txt").write_text(" # made elsewhere\n0.5\t1.5 -2 0.25 0 0 0.7071 0.7071\n\n")
     (stamp,), (read,) = read_tum(tmp_path / "other.txt")
     assert stamp == 0.5
     np.testing.assert_allclose(read, pose, atol=1e-12)

@@ -78,9 +78,7 @@ def test_draw_covers_only_the_given_frames() -> None:
 def test_images_stay_on_the_host_where_the_device_is_full(has_room: bool, monkeypatch) -> None:
     """Catches a long sequence that is copied to a small device: images stay, as 5 bytes a pixel."""
     asked, device = [], torch.device("meta")
-    monkeypatch.setattr(
-        "nbtrack.data.pixels.has_room_for", lambda *question: asked.append(question) or has_room
-    )
+    monkeypatch.setattr("nbtrack.data.pixels.has_room_for", lambda *a: asked.append(a) or has_room)
     sampler = PixelSampler(random_sequence(3), device)
     images = {sampler.colors.device.type, sampler.depths_mm.device.type}
     assert images == {"meta" if has_room else "cpu"}

@@ -83,9 +83,8 @@ def test_rays_and_distances_find_the_first_surface(body):
 
 def test_values_by_hand():
     """Catches 0/0 for rays along faces. Sizes and turns of boxes: the recorded views."""
-    box = Box((0.0, 0.0, 0.0), (2.0, 2.0, 4.0))
     origin, along = np.array([0.0, 0.0, -6.0]), np.array([[0.0, 0.0, 2.0]])
-    assert box.hit(origin, along)[0] == 2.0
+    assert Box((0.0, 0.0, 0.0), (2.0, 2.0, 4.0)).hit(origin, along)[0] == 2.0
     rod = Cylinder((0.0, 0.0, -1.0), (0.0, 0.0, 1.0), 0.2)
     assert rod.hit(origin, along)[0] == pytest.approx(2.5)
     assert rod.hit(origin + np.array([0.3, 0.0, 0.0]), along)[0] == np.inf
