@@ -308,8 +308,8 @@ def test_how_far_apart_a_wall_lies_by_hand(place_m, changes, residual_m, depth_m
 
 
 def test_what_is_hidden_or_late() -> None:
-    """Catches points that count although a surface before them hides them; and depth that comes
-    before the poses, or is not interpolated: of 21 frames, each 2.5 cm ahead."""
+    """Catches points that count although a surface before them hides them; and lateness that is
+    left out, or poses that are not interpolated: of 21 frames, each 2.5 cm ahead."""
     assert wall_from(0.2).compare(READING).overlap == 0
     for late in (0.0, 1.0, 0.5):
         # The first frame cannot be later: only the last one's pose is then too far ahead.
