@@ -76,10 +76,8 @@ def plot_idea(
 def _points_of_row(frame: Frame, row: int, column: int) -> tuple[Tensor, Tensor]:
     """The points (m, camera frame) of a row's measured pixels (n, 3), and of one of them (3,).
 
-    This one is the measured pixel nearest to (row, column); the row is that of this pixel.
-
-    Raises:
-        ConfigError: the frame has no depth.
+    This one is the measured pixel nearest to (row, column); the row is that of this pixel. Raises
+    ConfigError if the frame has no depth.
     """
     pixels = frame.measured_pixels()
     if not pixels.numel():
