@@ -107,7 +107,7 @@ NOT_PROVED = "poses.txt is not proved: "
 ONE_WARNING = {
     "still": (walk(30, 0.0, 0.0), NOT_PROVED + ".* other conventions fit about as well"),
     "one frame": (walk(1), NOT_PROVED + "two frames see too little of the same"),
-    "outliers": (BESIDE, "3 of 16 poses lie up to .*, first img3.png"),
+    "outliers": (BESIDE, "3 of 16 poses lie up to .*, first near img3.png"),
 }
 
 

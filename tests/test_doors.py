@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from box_room import BoxRoom, box_sequence, walk
+from box_room import BoxRoom, box_sequence, poses_at, walk
 from tiny import TINY
 
 import nbtrack
@@ -126,6 +126,7 @@ REFUSED = {
     "no table of losses": lambda: write_map("here", replace(mapped(), history=None)),
     "a size for a camera": lambda: replace(SEQUENCE, intrinsics=(32, 24)),
     "a picture without a camera": lambda: DENSITY.render_view(None, np.eye(4)),
+    "a start in another world": lambda: tracker(pose=poses_at([[1e3, 0, 0]])[0]),
     "a pose in the complex plane": lambda: tracker(pose=np.eye(4) * 1j),
     "an array of one number": tracked_with(rates_hz=np.array(10)),
     "fewer tracked": lambda: nbtrack.track_scenes(**scenes(), tracked=2 * scenes()["scenes"]),
@@ -223,6 +224,8 @@ def test_trackers_are_copied_and_fields_are_theirs(copied, name: str) -> None:
     found += [copied(each).track(SEQUENCE[3]).T_world_camera for each in (first, second)]
     assert np.array_equal(*found[:2])
     assert np.array_equal(*found[2:])
+    first.estimates[-1][0, 3] = 1e3  # lost
+    assert copied(first).estimates[-1][0, 3] == 1e3
 
 
 def test_a_map_of_the_cache_stays_as_it_was_read() -> None:

@@ -97,6 +97,7 @@ MESH = ["export", "map", "--to", "glb", "m.glb"]
 COMMANDS = {"OWN": OWN, "GIVEN": GIVEN, "MAP": MAP}
 CUT = "not a readable checkpoint"
 TRAJECTORY, MAP_FILE, RUN = "run/trajectory.txt", "map/map.safetensors", "run/metrics.json"
+COMMAS = "frame_id,time,translation_error_m,without_depth\n" + 5 * "1,0,1,0,2,False\n"
 ROW = "0.1 1 2 3 0 0 0 1"
 RUN_OF_WORDS = {"estimates": "here", "rows": [], "tracker": {}, "budget": {}}
 KILLED_MAP = "maps", "map.safetensors", "mapping.pt"
@@ -123,6 +124,7 @@ FAULTS: dict[str, tuple[Callable[[], object], list[str], str]] = {
     "no entries": (_write(RUN, "{}"), KITTI, "run is not a readable run"),
     "a number for a map": (_put("map", 3), [*MESH[:1], "run", *MESH[2:]], "metrics.json is 3"),
     "a text for an origin": (_put("origin", "000"), KITTI, "metrics.json is '000'"),
+    "decimal commas": (_write("run/frames.csv", COMMAS), KITTI, "run is not a readable"),
     "other columns": (_write("run/frames.csv", "a\n" + 4 * "1\n"), KITTI, "run is not a readable"),
 }
 for case, (content, says) in TOML.items():

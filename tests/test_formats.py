@@ -77,6 +77,11 @@ def test_depth_and_poses_of_a_phone(tmp_path: Path, monkeypatch) -> None:
     for path in folder.glob("rgbd/[345].*"):
         path.unlink()
     np.testing.assert_allclose(open_recording(folder).T_world_camera, source().poses[:3], atol=1e-9)
+    times = np.array([0, 2, 3]) / 60  # of the images, on the clock of the poses
+    np.savetxt(folder / "timestamps.txt", times)
+    poses = source().poses[[0, 2, 3]]
+    np.testing.assert_allclose(open_recording(folder).T_world_camera, poses, atol=1e-9)
+    (folder / "timestamps.txt").unlink()
     for path in (folder / "rgbd").glob("*.depth"):
         path.write_bytes(b"bvx2" + path.read_bytes())
     monkeypatch.setitem(sys.modules, "liblzfse", None)

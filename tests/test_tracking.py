@@ -1,6 +1,7 @@
 """Adam's trackers, and what all trackers share, in fields whose answers are known exactly."""
 
 import hashlib
+from contextlib import nullcontext
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -227,6 +228,15 @@ def test_an_estimate_is_the_users_own() -> None:
     assert second.T_world_camera[0, 3] - first.T_world_camera[0, 3] == pytest.approx(0.1)
     second.T_world_camera[:] = np.nan
     assert np.isfinite(np.stack(tracker.estimates)).all()
+
+
+def test_a_report_adds_columns(monkeypatch) -> None:
+    """Catches a column of the table that an own tracker's report replaces, as steps in its unit."""
+    for column, outcome in (("steps", pytest.raises(ConfigError)), ("gain", nullcontext())):
+        monkeypatch.setattr(Sliding, "report", lambda self, column=column: {column: 7.0})
+        with outcome:
+            frames = track_sequence(Sliding(BoxRoom(), np.eye(4), StepBudget(1)), walk(2)).frames
+    assert (frames["gain"] == 7).all()
 
 
 @pytest.mark.parametrize("pose", [2 * torch.eye(4), torch.eye(4)[None], np.eye(3)])

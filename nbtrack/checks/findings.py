@@ -184,7 +184,7 @@ def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
         first = recording.color_files[odd.index[0]].name
         found = f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path"
         advice = "check the poses there, or leave frames out with --frames of map and track"
-        yield f"{found} of their neighbours, first {first}: {advice}"
+        yield f"{found} of their neighbours, first near {first}: {advice}"
 
 
 def of_held_poses(frames: pd.DataFrame) -> Iterator[str]:

@@ -130,8 +130,9 @@ def read_trajectory(folder: Path) -> Trajectory:
             T_true[np.searchsorted(times, times_known)] = T_known  # rows of the same times
         frames = pd.read_csv(folder / "frames.csv")
         frames[_COLUMNS].astype(float)  # raises for other columns
-        if len(frames) != len(T_estimated):
-            raise ValueError(f"{len(frames)} rows for {len(T_estimated)} poses")
+        # pandas numbers the rows, but not if they have more entries than the header.
+        if not frames.index.equals(pd.RangeIndex(len(T_estimated))):
+            raise ValueError("frames.csv has no row of its columns for each pose")
         metrics = read_object(folder / METRICS_FILE)
         for name, kind in _ENTRIES.items():
             check_argument(f"{name} in {folder / METRICS_FILE}", metrics[name], kind)

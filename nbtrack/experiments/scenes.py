@@ -14,6 +14,7 @@ from nbtrack.machinery.errors import ConfigError, DataError, MissingError, neare
 from nbtrack.machinery.files import absolute, data_folder, fingerprint, locked, runs_folder
 from nbtrack.machinery.progress import ProgressBar, tell
 from nbtrack.recordings import reading
+from nbtrack.recordings.formats import holds_recording
 from nbtrack.recordings.images import images_of
 from nbtrack.recordings.recording import Recording, open_recording
 from nbtrack.synthetic import ROOMS, Room, make_room, room_of, room_version
@@ -80,6 +81,8 @@ def open_scene(sequence: str | Path, preset: Preset, format: str | None = None) 
     the dataset was not downloaded.
     """
     text, folder = str(sequence), absolute(sequence)
+    if is_own_output(folder) and text not in _KNOWN and not holds_recording(folder):
+        raise ConfigError(f"{text} holds results of nbtrack: give the recording that was tracked")
     if text not in _KNOWN and folder.exists():
         return Scene(folder.name, folder, format)  # of a plain file: its opening says what to give
     if folder.is_dir() and not is_own_output(folder):

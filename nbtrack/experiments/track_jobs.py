@@ -149,8 +149,11 @@ class TrackJob(Job):
 
         T_first = sequence.T_world_camera[0]
         is_start_known = self._starts_at(T_first)
-        T_start = T_first if is_start_known else np.eye(4)  # a placeholder: the camera is found
         field, budget = finished.field, make_budget(self.steps, self.rate_hz)
+        T_start = T_first
+        if not is_start_known:  # a placeholder: the camera is found
+            T_start = np.eye(4)
+            T_start[:3, 3] = field.bounds.center
         tracker = make_tracker(self.tracker, field, T_start, budget, self.settings, self.seed)
         checkpoint = self.folder / RUN_FILE
         tracked = track_sequence(tracker, sequence, checkpoint, report_frame, is_start_known)

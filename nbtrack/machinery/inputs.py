@@ -132,6 +132,23 @@ def checked_pose(T_world_camera: Any) -> Float[np.ndarray, "4 4"]:
     return checked_poses(pose[None], Path("T_world_camera"))[0]
 
 
+def checked_start(
+    pose: Any, minimum: tuple[float, ...], maximum: tuple[float, ...]
+) -> Float[np.ndarray, "4 4"]:
+    """`checked_pose` of a camera in a map, whose box (m) the corners `minimum` and `maximum` span.
+
+    It also raises DataError if no depth image reaches the box from there: so a pose in another
+    world than the map's, or in millimetres, is found.
+    """
+    start = checked_pose(pose)
+    outside_m = np.linalg.norm(start[:3, 3] - start[:3, 3].clip(minimum, maximum))
+    if outside_m > MILLIMETRE * _MAX_MILLIMETRES:
+        found = f"the start lies {outside_m:.0f} m outside of the map"
+        advice = "give it in the map's world, as by read_sequence(origin=room.record['origin'])"
+        raise DataError(f"{found}: {advice}")
+    return start
+
+
 def checked_poses(poses: Float[np.ndarray, "_ 4 4"], path: Path) -> Float[np.ndarray, "_ 4 4"]:
     """Check the poses (m) of a file's frames; returns them with NaN for frames that have none.
 

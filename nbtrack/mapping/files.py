@@ -86,7 +86,7 @@ def write_map(path: Path | str, finished: Map) -> None:
         content = safetensors.torch.save(tensors, {_FORMAT: json.dumps(header, allow_nan=False)})
         # Read the content as a test: this raises for what could not be read from the file either.
         if _map_of(content, path).key != finished.key:
-            raise ValueError("it is read as another map")
+            raise ValueError("it is read as another map, as weights of other than float32 are")
     others = {}
     if path.name == MAP_FILE:  # the folder's other files belong to the map; None removes a file
         history = finished.history.rename_axis("iteration")

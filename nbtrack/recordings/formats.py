@@ -103,7 +103,8 @@ class Format:
     known_cameras: tuple[Calibration, ...] = ()
     declared: Declaration = Declaration()  # what its numbers mean
     counts_from_0: bool = False  # the number of an image is the place of its pose in the pose file
-    stamps_tell: bool = True  # whether times in a pose file tell the frames; else the order does
+    # Whether times in a pose file tell the frames; else the order does, unless frames have times.
+    stamps_tell: bool = True
     resize_color: bool = False  # colour has another size than depth and shows the same view
     # Reads a file's poses and their times (s; NaN: none), given the order of its quaternions. An
     # error of any type that it or `read_camera` raises for a damaged file becomes a DataError.

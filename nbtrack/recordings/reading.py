@@ -39,16 +39,20 @@ def parse_frames(text: str) -> slice:
 
 
 def read_sequence(
-    folder: Path | str, frames: slice = slice(None), **options: str | None
+    folder: Path | str,
+    frames: slice = slice(None),
+    origin: Position | None = None,
+    **options: str | None,
 ) -> RgbdSequence:
     """Read the frames of a recording that have a pose, all or those of a slice.
 
+    `origin` is as in `read_frames`; to track in a map, give `record["origin"]` of that map.
     `options` are `format`, `depth_folder` and `pose_file`, as `open_recording` takes them. For
     example, a Neural RGB-D scene also has depth in the folders `depth` and `depth_with_noise`, and
     poses in `trainval_poses.txt` (BundleFusion's, in another world frame). Raises MissingError,
     DataError or ConfigError if something is not there, wrong or unknown.
     """
-    return read_frames(open_recording(folder, **options), frames)
+    return read_frames(open_recording(folder, **options), frames, origin=origin)
 
 
 def read_frames(

@@ -187,7 +187,8 @@ def _poses_and_times(
     if "*" in path.name:  # every frame has a file of its own
         check_paired(moments.images, files)
         return listed, times, ""
-    # In formats without `stamps_tell` the stamps are times, but do not say whose a pose is.
-    telling = stamps if layout.stamps_tell else np.full(len(stamps), np.nan)
+    # In formats without `stamps_tell` a stamp says whose a pose is only if frames have times, too.
+    tells = layout.stamps_tell or moments.recorded_times is not None
+    telling = stamps if tells else np.full(len(stamps), np.nan)
     poses, note = moments.poses_of(path, listed, telling, declared.inverted_if_world_to_camera)
     return poses, times, f"{path.name}: {note}" if note else ""

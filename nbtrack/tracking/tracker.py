@@ -14,7 +14,7 @@ from nbtrack.data.frame import Frame
 from nbtrack.fields import FIELDS, Field, LearnedField
 from nbtrack.machinery.device import suited_to, synchronize, usual_modes
 from nbtrack.machinery.errors import ConfigError, NumericalError, typed
-from nbtrack.machinery.inputs import checked_pose, whole_number
+from nbtrack.machinery.inputs import checked_pose, checked_start, whole_number
 from nbtrack.machinery.launches import CALLS_BEFORE_RECORDING
 from nbtrack.machinery.registry import from_extra
 from nbtrack.machinery.settings import checked, one_of
@@ -90,7 +90,7 @@ class Tracker(abc.ABC):
 
         Raises ConfigError for a field in which the tracker does not work, or for a setting or seed
         that is not allowed; MissingError for a package that is not installed; DataError for a pose
-        that is not rigid.
+        that `restart` refuses.
         """
         self.check_field(field)
         self.settings = checked(self.Settings() if settings is None else settings, self.Settings)
@@ -138,7 +138,7 @@ class Tracker(abc.ABC):
         """Take one optimisation step; returns the loss before it, which may stay on a GPU."""
 
     def report(self) -> dict[str, float | bool]:
-        """What to record about the estimate, by column name.
+        """What to record about the estimate, by the name of a new column of `Trajectory.frames`.
 
         It holds `lost`, whether the camera is lost, if the tracker judges its estimates.
         """
@@ -165,9 +165,11 @@ class Tracker(abc.ABC):
         """Go on from another pose (m), as after an interruption.
 
         Earlier poses, and so the velocity, and what a subclass remembers are forgotten. The random
-        generator and the budget are not reset.
+        generator and the budget are not reset. Raises DataError for a pose that is not rigid, or so
+        far from the map that no depth image can reach it.
         """
-        self.estimates = [checked_pose(T_world_camera)]
+        bounds = self.field.bounds
+        self.estimates = [checked_start(T_world_camera, bounds.minimum, bounds.maximum)]
         for name in self.remembers:
             setattr(self, name, getattr(type(self), name))
 
@@ -207,7 +209,7 @@ class Tracker(abc.ABC):
 
         The state goes to `__setstate__`, which is `restore`.
         """
-        arguments = self.field, self.estimates[-1], self.budget, self.settings
+        arguments = self.field, self.estimates[0], self.budget, self.settings
         return type(self), arguments, self.state()
 
     __setstate__ = restore

@@ -13,7 +13,7 @@ from nbtrack.core.arrays import Poses
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.machinery import files
 from nbtrack.machinery.device import advise_on_memory
-from nbtrack.machinery.errors import DataError, typed
+from nbtrack.machinery.errors import ConfigError, DataError, typed
 from nbtrack.machinery.settings import as_dict
 from nbtrack.tracking.budget import StepBudget
 from nbtrack.tracking.metrics import pose_errors
@@ -108,7 +108,7 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
     error_m, error_deg = np.nan, np.nan
     if np.isfinite(T_true).all():
         (error_m,), (error_deg,) = pose_errors(estimate.T_world_camera[None], T_true[None])
-    return {
+    row = {
         "frame_id": int(sequence.frame_ids[index]),
         "time": float(sequence.times[index]),
         "steps": estimate.steps,
@@ -118,6 +118,8 @@ def _row(sequence: RgbdSequence, index: int, estimate: Estimate) -> dict[str, An
         "rotation_error_deg": float(error_deg),
         "still_error_m": float(np.linalg.norm((T_true - T_first)[:3, 3])),  # of standing still
         "without_depth": estimate.without_depth,
-        # As Python's numbers and flags, since a checkpoint cannot hold those of numpy or torch.
-        **{name: np.asarray(value).item() for name, value in estimate.report.items()},
     }
+    if taken := row.keys() & estimate.report.keys():
+        raise ConfigError(f"a tracker reports {sorted(taken)}, which nbtrack fills: rename them")
+    # As Python's numbers and flags, since a checkpoint cannot hold those of numpy or torch.
+    return row | {name: np.asarray(value).item() for name, value in estimate.report.items()}
