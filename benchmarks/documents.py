@@ -36,10 +36,7 @@ _HEADS = {
     "ICP, dense": "ICP 4096",
     "standing still": "still",
 }
-_COUNTS = {
-    "wrong_frames": "wrong", "longest_wrong": "longest stretch", "missed_frames": "missed",
-    "called_lost": "called lost", "frames_lost_in_vain": "in vain",
-}  # fmt: skip
+_COUNTS = {"wrong_frames": "wrong", "missed_frames": "missed", "frames_lost_in_vain": "in vain"}
 
 
 def shown(rows: pd.DataFrame, columns: dict[str, tuple[str, str]]) -> pd.DataFrame:
@@ -64,7 +61,7 @@ def recordings(runs: pd.DataFrame) -> pd.DataFrame:
     groups = runs.groupby(["frames", "method"], sort=False)
     table = (100 * groups[["median_error_m"]].mean()).map("{:.2f}".format)
     for name in _COUNTS:
-        table[name] = groups[name].agg(lambda counts: " / ".join(counts.astype(str)))
+        table[name] = groups[name].agg(lambda counts: ", ".join(counts.astype(str)))
     places = [f"`{frames}`: {method}" for frames, method in table.index]
     return table.rename(columns={"median_error_m": "median, cm", **_COUNTS}).set_axis(places)
 
@@ -80,12 +77,12 @@ def reference(rows: pd.DataFrame) -> pd.DataFrame:
 def searches(rows: pd.DataFrame) -> pd.DataFrame:
     """Counts of searches by scene and offset.
 
-    They are of poses that were found, of wrong ones, of wrong ones that were called lost, and of
-    right ones that were called lost.
+    They are of wrong poses, of wrong ones that were called lost, and of right ones that were called
+    lost.
     """
     wrong = (rows["error_m"] > 0.05) | (rows["error_deg"] > 3)
     rows = rows.assign(caught=rows["lost"] & wrong, wrong=wrong, alarm=rows["lost"] & ~wrong)
-    columns = {"recovered": "found", "wrong": "wrong", "caught": "called lost", "alarm": "in vain"}
+    columns = {"wrong": "wrong", "caught": "called lost", "alarm": "in vain"}
     groups = rows.groupby(["scene", "offset"], sort=False)
     counts = groups[[*columns]].sum().astype(int).rename(columns=columns)
     counts.insert(0, "searches", groups.size())
@@ -113,13 +110,13 @@ def fast(runs: pd.DataFrame) -> pd.DataFrame:
 
 
 def steps(cells: pd.DataFrame) -> pd.DataFrame:
-    """Steps in 500 ms by tracker and pixels, and an upper bound of a step's time (ms).
+    """Steps in 500 ms by tracker and pixels, and 500 ms over their number.
 
-    It is an upper bound, since the preparation of a frame and unused time are part of the 500 ms.
+    The preparation of a frame and unused time are part of the 500 ms.
     """
     cells = cells.query("budget_ms == 500").eval("ms = 500 / steps")
     cells.index = cells["tracker"] + " " + cells["n_pixels"].astype(str)
-    heads = {"steps": ("steps in 500 ms", "{:.1f}"), "ms": ("ms a step, at most", "{:.3g}")}
+    heads = {"steps": ("steps in 500 ms", "{:.1f}"), "ms": ("500 ms over steps", "{:.3g}")}
     return shown(cells, heads).T
 
 
