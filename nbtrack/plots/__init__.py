@@ -12,6 +12,7 @@ from nbtrack.plots.figures import (
     plot_errors,
     plot_frame,
     plot_images,
+    plot_intervals,
     plot_panels,
 )
 from nbtrack.plots.movie import cloud_of, movie_bytes, movie_pictures

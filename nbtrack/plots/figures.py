@@ -1,6 +1,6 @@
 """Figures of images, measured and rendered, and figures of numbers as curves and points."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import chain
 
 import matplotlib
@@ -247,6 +247,42 @@ def plot_curves(
     else:
         axes.figure.legend(loc="outside right center", handlelength=3)
     return axes.figure
+
+
+@style.styled
+def plot_intervals(
+    panels: Mapping[str, pd.DataFrame],
+    x: str,
+    title: str,
+    xlim: tuple[float, float],
+    ticks: Sequence[float],
+    scale: str = "linear",
+) -> Figure:
+    """Column `x` with its interval, by set of runs: a panel for each table, below its name.
+
+    Tables have columns `set` (the rows of a panel), `method` (colours), `from` and `to` (the ends
+    of the interval), `size` (the number of rooms, printed at the right) and `shown` (whether the
+    mark is filled). With the scale "log" a dashed line stands at 1.
+    """
+    sets = list(dict.fromkeys(chain.from_iterable(table["set"] for table in panels.values())))
+    row = style.new_axes(title, 1.2 + 0.3 * len(sets), 1, len(panels), sharey=True)[0]
+    for axes, (name, table) in zip(row, panels.items(), strict=True):
+        for k, (method, color) in enumerate(style.method_colors(table["method"]).items()):
+            of = table[table["method"] == method]
+            y = of["set"].map(sets.index) + 0.34 * (k - (table["method"].nunique() - 1) / 2)
+            axes.hlines(y, of["from"], of["to"], color)
+            fill = np.where(of["shown"], color, "white")
+            axes.scatter(of[x], y, c=fill, edgecolors=color, zorder=3, label=method)
+        for at, n in table.groupby("set")["size"].first().items():
+            look = {"va": "center", "ha": "right", "size": 8, "backgroundcolor": "w"}
+            axes.text(xlim[1], sets.index(at), f"{n} room" + "s" * (n > 1), **look)
+        axes.set(xscale=scale, xlim=xlim, ylim=(len(sets) - 0.5, -0.5), xlabel=x, title=name)
+        axes.set_yticks(range(len(sets)), sets)
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.minorticks_off()
+        if scale == "log":
+            axes.axvline(1, **style.DASHED)
+    return row[0].figure
 
 
 def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray:

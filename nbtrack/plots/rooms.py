@@ -126,7 +126,7 @@ def plot_map_and_slice(
     """
     mesh = extract_mesh(field, sequence, voxel=voxel)
     up = scene.up_of(sequence.T_world_camera)
-    left, middle, right = new_axes(title, 3.2, 1, 3, width_ratios=[1, 1, 1.3])[0]
+    left, middle, right = new_axes(title, 3.4, 1, 3, width_ratios=[1.3, 1.3, 1])[0]
     left.figure.get_layout_engine().set(wspace=0.08)
     middle.sharex(left)
     middle.sharey(left)
@@ -146,6 +146,7 @@ def plot_map_and_slice(
     for axes, name in (left, "surface: the zero level"), (middle, "slice at the cameras' height"):
         scene.draw_paths(axes, T_paths, to_page, 0.7)
         axes.set_title(name)
+        axes.set_anchor("N")  # as high as the last panel
     scene.draw_scale(left, middle)
     left.margins(0.01)
     first, *others = paths

@@ -189,7 +189,7 @@ def draw_slice(
         # Lines are white where the slice is dark.
         tones = ["1" if abs(line) > 0.6 * image.norm.vmax else "0.35" for line in _LINES_M]
         draw_levels(axes, places, values, _LINES_M, colors=tones, linewidths=0.4, linestyles="-")
-        axes.hlines([], 0, 0, "0.35", linewidth=0.6, label="every 0.25 m")
+        axes.hlines([], 0, 0, "0.35", linewidth=0.6, label="distance: every 0.25 m")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
     name, _, unit = field.value_label.removesuffix(")").partition(" (")  # for "density of 20/m"
     what = "surface" if field.is_distance else f"{name} of {level:g}{unit.removeprefix('1')}"
