@@ -145,8 +145,7 @@ def plot_map_and_slice(
     middle.set_aspect("equal")
     for axes, name in (left, "surface: the zero level"), (middle, "slice at the cameras' height"):
         scene.draw_paths(axes, T_paths, to_page, 0.7)
-        axes.set_title(name)
-        axes.set_anchor("N")  # as high as the last panel
+        axes.set(title=name, anchor="N")  # as high as the last panel
     scene.draw_scale(left, middle)
     left.margins(0.01)
     first, *others = paths
