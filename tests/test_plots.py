@@ -143,21 +143,21 @@ def test_curves_of_methods_and_sweeps() -> None:
 
 def test_intervals_stand_in_the_row_of_their_set() -> None:
     """Catches a panel that orders its sets by itself, so that rows would have another's label, an
-    interval or a number of rooms in another row, and a mark filled where nothing is shown."""
-    columns = ["set", "method", "share (%)", "from", "to", "size", "shown"]
-    rows = [["b", "VR", 50.0, 20.0, 80.0, 9, True], ["a", "VR", 0.0, 0.0, 30.0, 1, False]]
+    interval or a text in another row, and a mark filled where nothing is shown."""
+    columns = ["set", "method", "share (%)", "from", "to", "text", "shown"]
+    rows = [["b", "VR", 50.0, 20.0, 80.0, "9", True], ["a", "VR", 0.0, 0.0, 30.0, "1", False]]
     table = pd.DataFrame(rows, columns=columns)
     panels = {"one": table, "two": table[::-1]}
     figure = plots.plot_intervals(panels, columns[2], "more", (0, 150), (0, 100))
     assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["b", "a"]
     for axes, order in zip(figure.axes, ([0, 1], [1, 0]), strict=True):
-        lines, points = axes.collections
+        lines, points, _ = axes.collections
         ends = [[[rows[i][3], i], [rows[i][4], i]] for i in order]
         assert [line.tolist() for line in lines.get_segments()] == ends
         assert points.get_offsets().tolist() == [[rows[i][2], i] for i in order]
         assert [color.min() < 1 for color in points.get_facecolors()] == [rows[i][6] for i in order]
         of_row = {text.get_position()[1]: text.get_text() for text in axes.texts}
-        assert of_row == {0: "9 rooms", 1: "1 room"}
+        assert of_row == {0: "9", 1: "1"}
 
 
 def test_panels_share_rows_and_limits() -> None:

@@ -261,11 +261,11 @@ def plot_intervals(
     """Column `x` with its interval, by set of runs: a panel for each table, below its name.
 
     Tables have columns `set` (the rows of a panel), `method` (colours), `from` and `to` (the ends
-    of the interval), `size` (the number of rooms, printed at the right) and `shown` (whether the
-    mark is filled). With the scale "log" a dashed line stands at 1.
+    of the interval), `text` (one for each set, printed at the right) and `shown` (whether the mark
+    is filled). With the scale "log" a dashed line stands at 1.
     """
     sets = list(dict.fromkeys(chain.from_iterable(table["set"] for table in panels.values())))
-    row = style.new_axes(title, 1.2 + 0.3 * len(sets), 1, len(panels), sharey=True)[0]
+    row = style.new_axes(title, 1.2 + 0.34 * len(sets), 1, len(panels), sharey=True)[0]
     for axes, (name, table) in zip(row, panels.items(), strict=True):
         for k, (method, color) in enumerate(style.method_colors(table["method"]).items()):
             of = table[table["method"] == method]
@@ -273,16 +273,17 @@ def plot_intervals(
             axes.hlines(y, of["from"], of["to"], color)
             fill = np.where(of["shown"], color, "white")
             axes.scatter(of[x], y, c=fill, edgecolors=color, zorder=3, label=method)
-        for at, n in table.groupby("set")["size"].first().items():
-            look = {"va": "center", "ha": "right", "size": 8, "backgroundcolor": "w"}
-            axes.text(xlim[1], sets.index(at), f"{n} room" + "s" * (n > 1), **look)
+        axes.scatter([], [], c="0.3", label="filled: shown")
+        for at, text in table.groupby("set")["text"].first().items():
+            look = {"va": "center", "ha": "right", "size": 8, "zorder": 2.2}
+            axes.text(xlim[1], sets.index(at), text, bbox={"fc": "w", "ec": "w", "pad": 1}, **look)
         axes.set(xscale=scale, xlim=xlim, ylim=(len(sets) - 0.5, -0.5), xlabel=x, title=name)
         axes.set_yticks(range(len(sets)), sets)
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.minorticks_off()
         if scale == "log":
             axes.axvline(1, **style.DASHED)
-    return row[0].figure
+    return row[0].figure.legend_below()
 
 
 def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray:
