@@ -148,7 +148,7 @@ def test_intervals_stand_in_the_row_of_their_set() -> None:
     rows = [["b", "VR", 50.0, 20.0, 80.0, "9", True], ["a", "VR", 0.0, 0.0, 30.0, "1", False]]
     table = pd.DataFrame(rows, columns=columns)
     panels = {"one": table, "two": table[::-1]}
-    figure = plots.plot_intervals(panels, columns[2], "more", (0, 150), (0, 100))
+    figure = plots.plot_intervals(panels, columns[2], "more")
     assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["b", "a"]
     for axes, order in zip(figure.axes, ([0, 1], [1, 0]), strict=True):
         lines, points, _ = axes.collections

@@ -1,6 +1,6 @@
 """Figures of images, measured and rendered, and figures of numbers as curves and points."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import chain
 
 import matplotlib
@@ -251,21 +251,17 @@ def plot_curves(
 
 @style.styled
 def plot_intervals(
-    panels: Mapping[str, pd.DataFrame],
-    x: str,
-    title: str,
-    xlim: tuple[float, float],
-    ticks: Sequence[float],
-    scale: str = "linear",
+    panels: Mapping[str, pd.DataFrame], x: str, title: str = "", log: bool = False
 ) -> Figure:
     """Column `x` with its interval, by set of runs: a panel for each table, below its name.
 
     Tables have columns `set` (the rows of a panel), `method` (colours), `from` and `to` (the ends
-    of the interval), `text` (one for each set, printed at the right) and `shown` (whether the mark
-    is filled). With the scale "log" a dashed line stands at 1.
+    of the interval), `text` (one for each set, printed right of the panel) and `shown` (whether the
+    mark is filled). With `log` x is logarithmic and a dashed line stands at 1.
     """
     sets = list(dict.fromkeys(chain.from_iterable(table["set"] for table in panels.values())))
-    row = style.new_axes(title, 1.2 + 0.34 * len(sets), 1, len(panels), sharey=True)[0]
+    height = 1.2 + 0.34 * len(sets)
+    row = style.new_axes(title, height, 1, len(panels), sharex=True, sharey=True)[0]
     for axes, (name, table) in zip(row, panels.items(), strict=True):
         for k, (method, color) in enumerate(style.method_colors(table["method"]).items()):
             of = table[table["method"] == method]
@@ -274,14 +270,13 @@ def plot_intervals(
             fill = np.where(of["shown"], color, "white")
             axes.scatter(of[x], y, c=fill, edgecolors=color, zorder=3, label=method)
         axes.scatter([], [], c="0.3", label="filled: shown")
+        beside = {"transform": axes.get_yaxis_transform(), "va": "center", "size": 8}
         for at, text in table.groupby("set")["text"].first().items():
-            look = {"va": "center", "ha": "right", "size": 8, "zorder": 2.2}
-            axes.text(xlim[1], sets.index(at), text, bbox={"fc": "w", "ec": "w", "pad": 1}, **look)
-        axes.set(xscale=scale, xlim=xlim, ylim=(len(sets) - 0.5, -0.5), xlabel=x, title=name)
+            axes.text(1.02, sets.index(at), text, **beside)
+        axes.set(ylim=(len(sets) - 0.5, -0.5), xlabel=x, title=name)
         axes.set_yticks(range(len(sets)), sets)
-        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axes.minorticks_off()
-        if scale == "log":
+        style.log_axes(axes, "x" if log else "")
+        if log:
             axes.axvline(1, **style.DASHED)
     return row[0].figure.legend_below()
 
