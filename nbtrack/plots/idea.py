@@ -147,6 +147,6 @@ def _draw_queries(
     axes.scatter(*start.T, s=20, label="measured points", color=_COLORS["true"], **_DOT)
     # An entry in the legend, which cannot show the arrows of `quiver`.
     arrow = {"marker": r"$\rightarrow$", "markersize": 18, "linestyle": "none"}
-    axes.plot([], [], color=_COLORS["SDF"], label="|d| against the gradient", **arrow)
+    axes.plot([], [], color=_COLORS["SDF"], label="−d along the gradient", **arrow)
     look = {"color": _COLORS["SDF"], "angles": "xy", "scale_units": "xy", "scale": 1, "zorder": 5}
     axes.quiver(*start.T, *(end - start).T, units="inches", width=0.022, **look)

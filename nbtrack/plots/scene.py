@@ -192,7 +192,7 @@ def draw_slice(
         axes.hlines([], 0, 0, "0.35", linewidth=0.6, label="distance: every 0.25 m")
     draw_levels(axes, places, values, [level], colors="black", linewidths=1.4)
     name, _, unit = field.value_label.removesuffix(")").partition(" (")  # for "density of 20/m"
-    what = "surface" if field.is_distance else f"{name} of {level:g}{unit.removeprefix('1')}"
+    what = "zero level" if field.is_distance else f"{name} of {level:g}{unit.removeprefix('1')}"
     axes.hlines([], 0, 0, "black", linewidth=1.4, label=what)
     if seen is not None:
         _draw_veil(axes, xy, seen, **look)
