@@ -143,6 +143,9 @@ def test_frames_without_pose(box: Path, tmp_path: Path) -> None:
     assert report.best.apart < 0.01
     assert report.frames.moved_mm.max() == pytest.approx(MOVED_MM)
     assert report.frames.turned_deg.max() == pytest.approx(TURNED_DEG)
+    poses[8, 0, 3] += 0.2  # three frames after a pose, one before the next
+    rewrite_poses(box, poses)
+    assert check(box).frames.off_mm[8] == pytest.approx(200.0)
     every_second = as_written(BESIDE, "opengl")
     every_second[::2] = np.nan
     rewrite_poses(write_box(tmp_path / "beside", BESIDE), every_second)
