@@ -89,8 +89,7 @@ class Execution:
     """How jobs are run."""
 
     # The number of processes. By default one for each core; or this process alone if a GPU does the
-    # work, since jobs share its memory and gain less from running side by side
-    # (benchmarks/README.md).
+    # work, since jobs would share its memory.
     workers: int | None = None
     dask: str | None = None  # address of a Dask scheduler, whose workers run the jobs instead
     # Whether the other jobs still run when one raises an NbtrackError. The error is then returned
