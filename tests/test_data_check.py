@@ -102,12 +102,12 @@ def test_facts(box: Path) -> None:
 
 
 BESIDE = walk(N_FRAMES)
-BESIDE[[3, 8, 12], 0, 3] += 0.4  # m off the path
+BESIDE[[3, 8, 12], :3, 3] += [0.396, 0.04, 0.04]  # 0.4 m off the path
 NOT_PROVED = "poses.txt is not proved: "
 ONE_WARNING = {
     "still": (walk(30, 0.0, 0.0), NOT_PROVED + ".* other conventions fit about as well"),
     "one frame": (walk(1), NOT_PROVED + "two frames see too little of the same"),
-    "outliers": (BESIDE, "3 of 16 poses lie up to .*, first near img3.png"),
+    "outliers": (walk(N_FRAMES), "3 of 16 poses lie up to .*, first near img3.png"),
 }
 
 
@@ -115,13 +115,29 @@ ONE_WARNING = {
 def test_one_warning(tmp_path: Path, case: str) -> None:
     """Catches what is called right because nothing contradicts it, and statistics of nothing."""
     poses, says = ONE_WARNING[case]
-    report = check(write_box(tmp_path / "box", poses))
+    folder = write_box(tmp_path / "box", poses)
+    if case == "outliers":
+        rewrite_poses(folder, as_written(BESIDE, "opengl"))
+    report = check(folder)
     assert report.best is report.conventions[0]
     assert len(report.warnings) == 1
     *_, end = str(report).split("\n\n")
     assert re.match(f"verdict: .*{says}", " ".join(end.split()))
     assert max(map(len, str(report).replace(str(tmp_path), "").splitlines())) < 100
     assert "  next: python -m nbtrack data check " in str(report)  # and not to track
+
+
+def test_a_camera_that_was_moved_between_frames(tmp_path: Path) -> None:
+    """Catches right poses that are called wrong since the path has steps."""
+    assert check(write_box(tmp_path / "box", BESIDE)).verdict == "read rightly"
+
+
+def test_a_wall_that_is_seen_straight(tmp_path: Path) -> None:
+    """Catches the one depth of a wall, or of a floor from above, taken for no measurement."""
+    steps = np.arange(N_FRAMES)
+    turns = np.outer(np.radians(3) * steps, [0, 0, 1]) + 1e-4
+    poses = poses_at(np.outer(0.02 * steps, [1, 0.4, 0]), turns)
+    assert check(write_box(tmp_path / "box", poses, (0.8, 0.6, 1.5))).faults == []
 
 
 def test_a_unit_that_only_the_depth_tells(tmp_path: Path) -> None:
@@ -148,9 +164,8 @@ def test_frames_without_pose(box: Path, tmp_path: Path) -> None:
     assert check(box).frames.off_mm[8] == pytest.approx(200.0)
     every_second = as_written(BESIDE, "opengl")
     every_second[::2] = np.nan
-    rewrite_poses(write_box(tmp_path / "beside", BESIDE), every_second)
-    (said,) = check(tmp_path / "beside").warnings
-    assert said.startswith("1 of 8 poses lie up to 40 cm beside")
+    rewrite_poses(write_box(tmp_path / "beside", walk(N_FRAMES)), every_second)
+    assert "1 of 8 poses lie up to 40 cm beside" in " ".join(check(tmp_path / "beside").warnings)
 
 
 def test_a_long_recording_is_read_in_parts(tmp_path: Path, monkeypatch) -> None:

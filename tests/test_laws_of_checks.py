@@ -33,24 +33,24 @@ def frames(**changes) -> pd.DataFrame:
 
 def test_a_value_that_many_pixels_share() -> None:
     """Catches a value that is told although it is rare, no spike, in few frames or of a camera that
-    hardly turns, or where hardly any value occurs: of 20 values with 100 pixels each and one more,
+    looks one way, or where hardly any value occurs: of 20 values with 100 pixels each and one more,
     in three of eight frames."""
     counts = np.zeros((2, 6000), int)
     counts[0, 1:21], counts[:, 50] = 100, [1001, 3]
-    assert findings.no_depth_values(counts, frames()) == [50]
+    assert findings.no_depth_values(counts, 8, 0.6) == [50]
     two = counts.copy()
     two[:, 7] = [1002, 3]
-    assert findings.no_depth_values(two, frames()) == [7, 50]
-    still = frames(turned_deg=0.04)  # a surface may have one depth in all of its images
+    assert findings.no_depth_values(two, 8, 0.6) == [7, 50]
     few, flat, seldom, rare = (counts.copy() for _ in range(4))
     few[0, 10:21], flat[0, 50], seldom[1, 50] = 0, 1000, 2
     rare[0, 100:], rare[0, 50] = 20, 1001
-    others = [(few, frames()), (flat, frames()), (seldom, frames()), (rare, frames())]
-    assert not any(findings.no_depth_values(*found) for found in [*others, (counts, still)])
+    assert not any(findings.no_depth_values(n, 8, 0.6) for n in (few, flat, seldom, rare))
+    assert not findings.no_depth_values(counts, 8, 0.4)  # a surface may have one depth in all
 
 
 def test_what_images_say() -> None:
-    """Catches frames that count although the camera stands, and means in place of medians."""
+    """Catches frames that count although the camera stands or sees nothing, and means in place of
+    medians."""
     often, half = np.array([0, 3, 1]), [False, True] * 4
     (black,) = findings.of_images(frames(brightness=[0.01] * 5 + [0.9] * 3), [], often)
     assert "are black" in black
@@ -61,7 +61,9 @@ def test_what_images_say() -> None:
     assert "75% of the depths are 1," in shared
     (none,) = findings.of_images(frames(measured=0.0), [], often)
     assert "no pixel" in none
-    assert [*findings.of_images(frames(is_repeated=half, moved_mm=0.0), 0, often)] == []
+    still, empty = {"moved_mm": 0.9, "turned_deg": 0.04}, {"measured": [1.0, 0.0] * 4}
+    for quiet in (still, empty):
+        assert [*findings.of_images(frames(is_repeated=half, **quiet), [], often)] == []
 
 
 def test_poses_beside_the_path() -> None:
@@ -70,11 +72,12 @@ def test_poses_beside_the_path() -> None:
     recording = mock.Mock(spec=Recording, color_files=[Path(f"img{k}.png") for k in range(8)])
     off = [1.0, 1, 100, 200, 100, 1, 1, 1]
     long = [30.0] * 7 + [2000.0]
-    (odd,) = findings.of_poses(frames(off_mm=off, moved_mm=long), recording)
-    assert odd.startswith("1 of 8 poses lie up to 20 cm beside")
-    assert "first img3.png" in odd
+    odd = findings.odd_poses(frames(off_mm=off, moved_mm=long))
+    (said,) = findings.of_poses(odd, 8, recording)
+    assert said.startswith("1 of 8 poses lie up to 20 cm beside")
+    assert "first near img3.png" in said
     for quiet in (frames(off_mm=off, moved_mm=90.0), frames(off_mm=49.0, moved_mm=1.0)):
-        assert [*findings.of_poses(quiet, recording)] == []
+        assert findings.odd_poses(quiet).empty
 
 
 def test_poses_that_are_held() -> None:
@@ -138,7 +141,7 @@ def test_a_cause_is_named() -> None:
         one = replace(usual, cost_left=left, numbers={"depth_error_per_m": (0.003, low, 0.004)})
         assert one.is_significant is is_significant
     assert not replace(large, cost_left=0.8).is_significant
-    assert not replace(usual, numbers={"depth_error_per_m": (0.06, 0.05, 0.07)}).is_significant
+    assert not replace(usual, numbers={"depth_error_per_m": (0.016, 0.014, 0.018)}).is_significant
 
 
 def test_several_numbers_must_explain_more() -> None:
@@ -155,6 +158,8 @@ def test_several_numbers_must_explain_more() -> None:
     (both,) = findings.misreading(replace(OWN, apart=0.05), other, [two])["fault"]
     assert "OpenGL axes" in both
     assert "and then the principal point" in both
+    (none,) = findings.misreading(replace(OWN, apart=0.05), other, [])["fault"]
+    assert "nothing that is tried" in none  # as the other convention leaves more than is usual
 
 
 def test_a_corrected_camera_by_hand() -> None:
@@ -168,7 +173,7 @@ def test_a_corrected_camera_by_hand() -> None:
 
 LIMITS = {
     "late": (0.3, 10.0), "focal_share": (0.01, 0.5), "depth_share": (0.01, 0.8),
-    "depth_error_per_m": (5e-4, 0.05), "depth_offset": (0.02, 0.5), "right": (0.005, 0.25),
+    "depth_error_per_m": (5e-4, 0.015), "depth_offset": (0.02, 0.5), "right": (0.005, 0.25),
     "down": (0.005, 0.25), "aspect": (0.01, 0.3), "y": (0.02, 1.0), "turn_z": (1.0, 30.0),
 }  # fmt: skip
 

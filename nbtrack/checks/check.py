@@ -12,7 +12,7 @@ from jaxtyping import Float
 from nbtrack.checks import findings
 from nbtrack.checks.conventions import MIN_OVERLAP, Convention, fit_all
 from nbtrack.checks.misfits import Misfit, fit_causes, main_misfits
-from nbtrack.checks.readings import FramePairs, Pairs, Reading, on_grid
+from nbtrack.checks.readings import FramePairs, Pairs, Reading, mean_apart, on_grid
 from nbtrack.core.arrays import Frames, Poses
 from nbtrack.data.sequence import ARRAYS, RgbdSequence
 from nbtrack.machinery.errors import DataError
@@ -111,15 +111,14 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     if is_whole and not frames.measured.any():
         raise DataError(f"no pixel of {recording.name} has a depth: check its folder and no_depth")
     as_declared = Reading(recording.declared, sequence.intrinsics)
-    no_depth = findings.no_depth_values(counts, frames)
+    no_depth = findings.no_depth_values(counts, len(frames), _looks_deg(T_world_camera))
     sequence.depths_mm[np.isin(sequence.depths_mm, no_depth)] = 0
     frame_pairs = FramePairs(recording, ids, sequence, pairs)
     conventions, best = fit_all(frame_pairs, as_declared)
     declared = conventions[0]
     cloud = _cloud(as_declared, sequence)
     is_far = cloud.depth > far_limit(cloud.depth)
-    # Causes are fitted to the gap that the best convention leaves.
-    has_gap = best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING
+    has_gap = best.overlap >= MIN_OVERLAP and best.apart > _ROUNDING  # that causes may explain
     has_enough = len(ids) >= _MIN_FRAMES or declared.is_far_apart  # few frames tell a large gap
     misfits = fit_causes(frame_pairs, best.reading) if has_gap and has_enough else []
     main = main_misfits(frame_pairs, best.reading, misfits)
@@ -128,11 +127,13 @@ def check_recording(recording: Recording, is_whole: bool = True) -> DataReport:
     faults = [*findings.of_images(frames, no_depth, counts[0]), *misread.get("fault", [])]
     doubts, remarks = misread.get("doubt", []), misread.get("note", [])
     if best is declared:  # otherwise the numbers of poses and depths mean nothing
-        faults += findings.of_poses(frames, recording) if "fault" not in misread else []
+        if "fault" not in misread:
+            odd = _contradicted(findings.odd_poses(frames), recording, ids, no_depth, declared)
+            faults += findings.of_poses(odd, len(frames), recording)
         doubts += findings.of_units(cloud.depth[~is_far])
         remarks += [*findings.of_depths(cloud.depth), *findings.of_held_poses(frames)]
-    if not (faults or doubts):
-        doubts = list(findings.doubts_of_poses(conventions, recording, is_whole, frames))
+    if not faults + doubts:
+        doubts += list(findings.doubts_of_poses(conventions, recording, is_whole, frames))
     return DataReport(
         recording, frames, T_world_camera, cloud[~is_far], conventions=conventions, best=best,
         misfits=misfits, faults=faults, doubts=doubts, remarks=remarks,
@@ -158,6 +159,34 @@ def _turned_deg(T_world_camera: Poses) -> Float[np.ndarray, "_"]:
     R = T_world_camera[:, :3, :3]
     cosine = ((R[:-1] * R[1:]).sum(axis=(1, 2)) - 1) / 2  # the sum is the trace of R_a^T R_b
     return np.degrees(np.arccos(cosine.clip(-1, 1)))
+
+
+def _looks_deg(T_world_camera: Poses) -> float:
+    """The mean angle (degrees) between the camera's optical axis and its mean direction."""
+    axes = T_world_camera[:, :3, 2]
+    mean = axes.mean(axis=0)
+    cosines = axes @ mean / max(np.linalg.norm(mean), 1e-9)  # of opposite axes the mean is 0
+    return float(np.degrees(np.arccos(cosines.clip(-1, 1))).mean())
+
+
+def _contradicted(
+    odd: pd.Series, recording: Recording, ids: Frames, no_depth: list[int], declared: Convention
+) -> pd.Series:
+    """The rows of `odd` whose frames' surfaces lie apart from those of the frame before or after.
+
+    So a wrong pose is told from a camera that was moved between two frames. Surfaces lie apart if
+    the mean gap is three times that of all pairs and 1 mm a metre, or unusual (our choice).
+    """
+    if odd.empty:
+        return odd
+    at = np.searchsorted(ids, odd.index)
+    pairs = np.hstack([[at - 1, at], [at, at + 1]])
+    stored = read_frames(recording, ids[np.unique(pairs)], as_stored=True)
+    depths = np.where(np.isin(stored.depths_mm, no_depth), np.uint16(0), stored.depths_mm)
+    seen = FramePairs(recording, ids, replace(stored, depths_mm=depths), pairs)
+    apart = [mean_apart(gaps) for gaps in seen.compare(declared.reading).area_gaps]
+    limit = min(max(3 * declared.apart, 1e-3), declared.usual_apart)
+    return odd[(np.reshape(apart, (2, -1)) > limit).any(axis=0)]
 
 
 def _pairs(T_world_camera: Poses, maximum: int) -> Pairs:

@@ -32,8 +32,11 @@ SHARED, _SHARING, _SPIKE = 0.01, 0.25, 10
 # What a cause with several numbers leaves of the cost, at most. Where poses jump by 5 cm, or depth
 # is wrong at edges, six numbers leave 0.44 or more; of a camera beside its poses 0.06 (our choice).
 _MAX_COST_OF_SEVERAL = 0.4
-# Of a camera that turns less (degrees a frame), a surface may have one depth in all images.
-_TURNS_DEG = 0.05
+# If the directions in which the camera looks spread by less (degrees), as from a gantry, a surface
+# may have one depth in all images.
+_LOOKS_DEG = 0.5
+# A camera that moves and turns less from frame to frame may measure the same again (our choice).
+_MOVES_MM, _TURNS_DEG = 1.0, 0.05
 _VALUES = 3  # a camera has at most so many values for no measurement (our choice)
 _FEW_VALUES = 10  # images of at most so many different depths do not tell (our choice)
 _BLACK = 0.02  # images are black if their median brightness, in [0, 1], is below this
@@ -65,7 +68,7 @@ def misreading(
         names = ", or as well that ".join(str(misfit) for misfit in main)
         parts.append(f"{names}; {remedy(main[0].reading, best.reading)}")
         kind, left = "note" if main[0].is_usual else "fault", main[0].apart
-    if parts:
+    if parts and left <= best.usual_apart:
         left_mm = 1e3 * left * best.depth_m
         tail = f"surfaces that two frames see then lie {left_mm:.0f} mm apart; as declared they"
         return {kind: [f"{', and then '.join(parts)} ({tail} {apart})"]}
@@ -80,12 +83,12 @@ def _unexplained(declared: Convention, apart: str) -> dict[str, list[str]]:
     text = (
         f"surfaces that two frames see {apart} (right recordings: up to {usual_mm:.0f} mm), and "
         "nothing that is tried explains it by itself: no other axes or directions of poses and "
-        "depth, no usual unit, no depth that comes up to ten frames late, no focal lengths or "
-        "principal point, no error of depth (a factor of 0.2 to 1.8, a length, a square), no "
-        "offset of the camera. What cannot be told: two mistakes at once, poses that drift, jump, "
-        "belong to other frames or have a scale of their own, things that move, a lens's "
-        "distortion, and depth images that hold no depth (disparity, half floats, each frame "
-        "scaled by itself)"
+        "depth, no usual unit, no depth that comes up to ten frames late, no focal lengths (a "
+        "factor of 0.5 to 1.5) or principal point, no error of depth (a factor of 0.2 to 1.8, a "
+        "length, a square), no offset of the camera (1 m, 30 degrees). What cannot be told: two "
+        "mistakes at once, poses that drift, jump, belong to other frames or have a scale of their "
+        "own, things that move, a lens's distortion, and depth images that hold no depth "
+        "(disparity, half floats, each frame scaled by itself)"
     )
     return {"fault" if declared.is_far_apart else "doubt": [text]}
 
@@ -125,18 +128,18 @@ def doubts_of_poses(
         yield f"{file} is not proved: {reason}: {why}"
 
 
-def no_depth_values(counts: Int[np.ndarray, "2 values"], frames: pd.DataFrame) -> list[int]:
+def no_depth_values(
+    counts: Int[np.ndarray, "2 values"], n_read: int, looks_deg: float
+) -> list[int]:
     """The depth values, at most `_VALUES`, that the camera gives for no measurement.
 
-    Many pixels share such a value, although the camera turns. `counts` and `frames` are those of
-    `check`: `counts[0]` tells how often each depth value occurs, and `counts[1]` in how many frames
-    a share of the pixels above `SHARED` has it.
+    Many pixels share such a value, although the directions in which the camera looks spread by
+    `looks_deg` on average. `counts[0]` tells how often each depth value occurs in `n_read` frames,
+    and `counts[1]` in how many of them a share of the pixels above `SHARED` has it.
     """
     n_pixels, n_frames = counts
-    is_shared = (n_pixels > SHARED * n_pixels.sum()) & (n_frames > _SHARING * len(frames))
-    is_shared &= (frames.turned_deg.mean() > _TURNS_DEG) & (
-        np.count_nonzero(n_pixels) > _FEW_VALUES
-    )
+    is_shared = (n_pixels > SHARED * n_pixels.sum()) & (n_frames > _SHARING * n_read)
+    is_shared &= (looks_deg > _LOOKS_DEG) & (np.count_nonzero(n_pixels) > _FEW_VALUES)
     most_frequent = np.argsort(-n_pixels)[: _VALUES + 1]
     # Frequencies fall by a factor above _SPIKE after the last value that is no measurement. Among
     # measurements a camera's rounding makes some frequent, but none by so much.
@@ -159,7 +162,8 @@ def of_images(
         found = f"{often[no_depth].sum() / often.sum():.0%} of the depths are "
         found += " or ".join(map(str, no_depth))
         yield f"{found}, which is no measurement; set no_depth = {no_depth} in sequence.toml"
-    repeated = (frames.is_repeated & (frames.moved_mm > 0)).mean()
+    moves = (frames.moved_mm > _MOVES_MM) | (frames.turned_deg > _TURNS_DEG)
+    repeated = (frames.is_repeated & moves & (frames.measured > 0)).mean()
     if repeated > _MIN_REPEATED:
         found = f"{repeated:.0%} of the depth images repeat the one before, though the poses move"
         yield f"{found}: leave the repetitions out of the recording, or give them no pose"
@@ -168,8 +172,8 @@ def of_images(
         yield f"the colour images are black: check their folder, or track without colour: {options}"
 
 
-def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
-    """A fault if some poses lie beside the path of their neighbours.
+def odd_poses(frames: pd.DataFrame) -> pd.Series:
+    """How far (m) those poses are off the path of their neighbours that lie far beside it.
 
     Call it only if the declared convention is the best one: the path is distorted under others.
     """
@@ -179,10 +183,17 @@ def of_poses(frames: pd.DataFrame, recording: Recording) -> Iterator[str]:
     # with the middle of their own neighbours. So of three frames in a row only the one that is
     # farthest off counts.
     largest_of_three = off.rolling(3, min_periods=1, center=True).max()
-    odd = off[is_odd & (off == largest_of_three)]
+    return off[is_odd & (off == largest_of_three)]
+
+
+def of_poses(odd: pd.Series, n_read: int, recording: Recording) -> Iterator[str]:
+    """A fault if some of `n_read` poses lie beside the path, and surfaces contradict them: `odd`.
+
+    `odd` has a row for each of them, as `odd_poses` has.
+    """
     if len(odd):
         first = recording.color_files[odd.index[0]].name
-        found = f"{len(odd)} of {len(off)} poses lie up to {100 * odd.max():.0f} cm beside the path"
+        found = f"{len(odd)} of {n_read} poses lie up to {100 * odd.max():.0f} cm beside the path"
         advice = "check the poses there, or leave frames out with --frames of map and track"
         yield f"{found} of their neighbours, first near {first}: {advice}"
 

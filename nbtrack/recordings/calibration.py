@@ -20,6 +20,7 @@ from nbtrack.machinery.inputs import read_numbers, read_object
 
 _CAMERA_LINE = "fx fy cx cy, a row of the 3x3 camera matrix, or one focal length"
 _LARGEST = 1e6  # a larger number in a calibration is a mistake: no image is so many pixels wide
+_SHORTEST = 0.1  # of the width: a focal length that gives a view of 157 degrees
 _LENS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in OpenCV's order
 # Names of entries in a camera's JSON file that have another name in this package.
 _OTHER_NAMES = {"w": "width", "h": "height", "scale": "depth_scale"}
@@ -59,7 +60,8 @@ class Calibration:
         """The camera of images of a size (pixels), to which the calibration is scaled.
 
         Raises DataError, which names the file `image`, if the calibration is for images of other
-        proportions, or if the principal point lies outside of the images.
+        proportions, if the principal point lies outside of the images, or if the focal length is
+        so short that it cannot be in pixels.
         """
         old_width, old_height = self.size or (width, height)
         factor = width / old_width
@@ -73,6 +75,9 @@ class Calibration:
             found = f"{image} is {width}x{height} but {self.source} is for {of_size}"
             advice = "images may be resized but not cropped; give their own camera, or its size"
             raise DataError(f"{found}, with cx, cy then at ({cx:.0f}, {cy:.0f}): {advice}")
+        if factor * self.fx < _SHORTEST * width:
+            found = f"{self.source} gives fx = {factor * self.fx:g} px for images {width} px wide"
+            raise DataError(f"{found}, a view of more than 157 degrees: give it in pixels")
         return Intrinsics(width, height, factor * self.fx, factor * self.fy, cx, cy)
 
 

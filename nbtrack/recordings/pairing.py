@@ -43,8 +43,8 @@ def check_paired(colors: list[Path], others: list[Path]) -> None:
         raise DataError(
             f"{colors[0].parent} has {len(colors)} images but {others[0].parent.name}/ has "
             f"{len(others)} {others[0].suffix} files: every image needs one of its number, and a "
-            f"folder one session; rename or remove the {len(odd)} that have none, or two: "
-            f"{', '.join(odd[:4])}"
+            f"folder one session; rename the {len(odd)} that have none, or two, so that equal "
+            f"numbers belong together, or remove them: {', '.join(odd[:4])}"
         )
     check_order(colors)
 

@@ -163,10 +163,11 @@ def _check_counter(numbers: Frames, names: str) -> None:
     # Hours, minutes or days repeat, and rise by 1 at a time.
     usual = max(1, np.median(steps))
     # If a counter went back to 0 at `end`, its sorted numbers have a wide gap, and from the last
-    # number over `end` to the first one it is about a usual step.
+    # number over `end` to the first one it is about a usual step. A gap of less than half of `end`
+    # is more likely of images that were taken out (our choice).
     for end in (10 ** len(str(last)), 12, 24, 31, 60, 2**8, 2**16, 2**32):
         step_over_end = numbers[0] + end - last
-        if 0 < step_over_end <= 2 * usual and steps.max() > 10 * usual:
+        if 0 < step_over_end <= 2 * usual and steps.max() > max(10 * usual, end / 2):
             i = steps.argmax()
             found = f"{names} have the numbers {numbers[0]} to {numbers[i]} and "
             found += f"{numbers[i + 1]} to {last}: a counter that went back to 0 at {end}?"
