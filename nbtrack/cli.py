@@ -238,4 +238,11 @@ def _parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
         if not given.startswith("-"):
             hint = "give the command no more than it takes"
         options.parser.error(f"unknown argument {unknown[0]!r}: {hint}")
+    words = sys.argv[1:] if arguments is None else arguments
+    for name in ("--scenes", "--method"):
+        if sum(word.partition("=")[0] == name for word in words) > 1:
+            options.parser.error(f"{name} is given twice: give it once, as A,B if it is a list")
+    for name, value in vars(options).items():
+        if value == "" and name != "caption":  # as of a variable that is not set
+            options.parser.error(f"{name} is empty: give a value, or leave it out")
     return options

@@ -122,6 +122,7 @@ REFUSED = {
     "a rate for rates": tracked_with(rates_hz=10),
     "a number for a method": lambda: find_methods([3]),
     "a text for settings": lambda: find_methods([replace(SDF, settings="tracking.sdf.seed=1")]),
+    "two of one label": lambda: find_methods([SDF, replace(SDF, field="neus_plus")]),
     "a number for a clock": lambda: ClockBudget(10, clock=5),
     "no table of losses": lambda: write_map("here", replace(mapped(), history=None)),
     "a size for a camera": lambda: replace(SEQUENCE, intrinsics=(32, 24)),
@@ -159,7 +160,7 @@ def test_right_in_another_form() -> None:
     assert SceneBounds(*np.array(UNIT)) == SceneBounds(*UNIT)
     of_numpy = [np.int64(32), np.int64(24), *map(np.float32, (24, 24, 16, 12))]
     assert repr(Intrinsics(*of_numpy)) == repr(Intrinsics(32, 24, 24.0, 24.0, 16.0, 12.0))
-    listed = replace(SDF, settings=["tracking.sdf.n_pixels=16"])
+    listed = replace(SDF, label="SDF", settings=["tracking.sdf.n_pixels=16"])
     assert find_methods([listed, SDF, "sdf", listed]) == [listed, SDF]
 
 

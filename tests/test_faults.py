@@ -93,6 +93,7 @@ TOML = {
     "deep table": (b".".join(5000 * [b"a"]) + b" = 1", "unknown config key 'a.a.a.a"),
 }
 KITTI = ["export", "run", "--to", "kitti", "poses.txt"]
+GIF = ["export", "run", "--to", "gif", "m.gif"]
 MESH = ["export", "map", "--to", "glb", "m.glb"]
 COMMANDS = {"OWN": OWN, "GIVEN": GIVEN, "MAP": MAP}
 CUT = "not a readable checkpoint"
@@ -107,7 +108,7 @@ KILLED_RUN = "tracks", "metrics.json", "run.pt"
 FAULTS: dict[str, tuple[Callable[[], object], list[str], str]] = {
     "no map": (_nothing, [*GIVEN, "nowhere"], "nowhere holds no finished map"),
     "a run for a map": (_nothing, [*GIVEN, "run"], "run holds no finished"),
-    "another file for a map": (_nothing, [*GIVEN, RUN], "map again, and give"),
+    "another file for a map": (_nothing, [*GIVEN, RUN], "map again; give the folder"),
     "map cut": (_cut(MAP_FILE), [*GIVEN, "map"], "not a readable map file"),
     "cached map cut": (_cut("runs/maps/*/map.safetensors"), MAP, "not a readable map file"),
     "history cut": (_write("map/history.csv", "a"), [*GIVEN, "map"], "not a readable history"),
@@ -124,6 +125,7 @@ FAULTS: dict[str, tuple[Callable[[], object], list[str], str]] = {
     "no entries": (_write(RUN, "{}"), KITTI, "run is not a readable run"),
     "a number for a map": (_put("map", 3), [*MESH[:1], "run", *MESH[2:]], "metrics.json is 3"),
     "a text for an origin": (_put("origin", "000"), KITTI, "metrics.json is '000'"),
+    "another recording": (_put("recording_key", "x"), GIF, "not the recording of this run"),
     "decimal commas": (_write("run/frames.csv", COMMAS), KITTI, "run is not a readable"),
     "other columns": (_write("run/frames.csv", "a\n" + 4 * "1\n"), KITTI, "run is not a readable"),
 }

@@ -203,7 +203,7 @@ def test_far_from_the_origin(tmp_path: Path, capsys) -> None:
         assert np.abs(places - utm).max() < 20
     assert np.abs(trimesh.load(tmp_path / "far/map/mesh.ply").bounds - utm).max() < 20
     origin = open_recording(folder).origin.tolist()
-    start = read_sequence(folder, origin=utm).T_world_camera[0, :3, 3]
+    start = read_sequence(folder, origin=utm.tolist()).T_world_camera[0, :3, 3]
     np.testing.assert_allclose(start, rows[0, 1:4] - utm, atol=1e-8)
     rows[:, 1:4] += [30.0, -40.0, 2.0]  # another end of the building
     np.savetxt(folder / "trajectory.txt", rows, fmt="%.17g")

@@ -109,6 +109,7 @@ NOT_IMPORTED = [
     ("own.py", None, "no file"),
     ("own.py", "x = 1\n1 / 0\n", "own.py, line 2 (ZeroDivisionError: division by zero)"),
     ("own.py", "x = (\n", "own.py, line 1"),
+    ("own.py", "import sys\nsys.exit(0)\n", "own.py, line 2 (SystemExit"),
     ("nbtrack_nowhere", None, "No module named 'nbtrack_nowhere'"),
     ("json.py", "", "rename"),
 ]

@@ -5,6 +5,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pandas as pd
@@ -207,13 +208,14 @@ def test_a_long_time_without_depth() -> None:
 
 
 class Sliding(Tracker):
-    """It moves by 10 cm in every step, in place."""
+    """It moves by 10 cm in every step, in place, and remembers its frames."""
 
-    name = "sliding"
+    name, remembers = "sliding", ("seen",)
+    seen: ClassVar = []
     T_world_camera = torch.eye(4, dtype=torch.float64)
 
     def begin(self, frame: Frame, T_starts: torch.Tensor) -> None:
-        pass
+        self.seen.append(frame.name)
 
     def step(self) -> torch.Tensor:
         self.T_world_camera[0, 3] += 0.1
@@ -231,12 +233,13 @@ def test_an_estimate_is_the_users_own() -> None:
 
 
 def test_a_report_adds_columns(monkeypatch) -> None:
-    """Catches a column of the table that an own tracker's report replaces, as steps in its unit."""
+    """Catches a column of the table that an own tracker's report replaces, as steps in its unit,
+    and a list in its memory that warm-up, or another tracker, has filled."""
     for column, outcome in (("steps", pytest.raises(ConfigError)), ("gain", nullcontext())):
-        monkeypatch.setattr(Sliding, "report", lambda self, column=column: {column: 7.0})
+        monkeypatch.setattr(Sliding, "report", lambda self, column=column: {column: len(self.seen)})
         with outcome:
-            frames = track_sequence(Sliding(BoxRoom(), np.eye(4), StepBudget(1)), walk(2)).frames
-    assert (frames["gain"] == 7).all()
+            frames = track_sequence(Sliding(BoxRoom(), np.eye(4), StepBudget(1)), walk(3)).frames
+    assert frames["gain"].tolist() == [1, 2]
 
 
 @pytest.mark.parametrize("pose", [2 * torch.eye(4), torch.eye(4)[None], np.eye(3)])

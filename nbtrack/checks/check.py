@@ -1,6 +1,5 @@
 """Validate a recording, and find from its own depth maps whether its numbers are read rightly."""
 
-import shlex
 import textwrap
 import zlib
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from nbtrack.core.arrays import Frames, Poses
 from nbtrack.data.sequence import ARRAYS, RgbdSequence
 from nbtrack.machinery.errors import DataError
 from nbtrack.machinery.progress import ProgressBar
+from nbtrack.machinery.registry import command_line
 from nbtrack.recordings.images import images_of
 from nbtrack.recordings.pose_files import shifted
 from nbtrack.recordings.reading import far_limit, read_frames, select_frames
@@ -80,7 +80,7 @@ class DataReport:
         # The first fault or doubt is in the verdict.
         texts = [f"  warning: {text}" for text in (self.faults + self.doubts)[1:]]
         texts += [f"  note: {text}" for text in (*recording.notes, *self.remarks)]
-        command = "track" if self.verdict == "read rightly" else "data check"
+        words = ["track"] if self.verdict == "read rightly" else ["data", "check"]
         lines = [
             f"{recording.name}: {recording.format.label}, {len(self.frames)} of {len(recording)} "
             f"frames have a pose, {camera.width} x {camera.height} px",
@@ -91,7 +91,7 @@ class DataReport:
             "  surfaces of two frames (mm apart in the mean, share of points), read as",
             "  > (in use) " + "\n             ".join(rows),
             *map(_LINES.fill, texts),
-            f"  next: python -m nbtrack {command} {shlex.quote(str(recording.folder))}",
+            f"  next: {command_line(*words, str(recording.folder))}",
             "",
             _LINES.fill(f"verdict: {self.verdict}"),
         ]

@@ -1,7 +1,6 @@
 """The functions that commands call; those of `tables` and `bench` are in `bench.py`, that of
 `export` in `exports.py`."""
 
-import shlex
 from argparse import Namespace
 from collections.abc import Iterator
 from typing import Any
@@ -20,6 +19,7 @@ from nbtrack.experiments.track_jobs import TrackJob, reach_warnings
 from nbtrack.machinery.errors import ConfigError, DataError
 from nbtrack.machinery.files import absolute, data_folder, write_atomic
 from nbtrack.machinery.progress import tell
+from nbtrack.machinery.registry import command_line
 from nbtrack.machinery.settings import flat, with_values
 from nbtrack.mapping.files import MESH_FILE, Map
 from nbtrack.plots import plot_overview
@@ -99,7 +99,8 @@ def track_command(options: Namespace) -> None:
     for line in _summary(metrics):
         print(f"  {line}")
     print(f"  files  {folder}: trajectory.txt (TUM), overview.png, metrics.json with all numbers")
-    print(f"  next   nbtrack export {shlex.quote(str(absolute(folder)))} --to gif tracking.gif")
+    command = command_line("export", str(absolute(folder)), "--to", "gif", "tracking.gif")
+    print(f"  next   {command}")
     _warn(metrics)
 
 

@@ -11,6 +11,7 @@ import trimesh
 from nbtrack.beyond.points import PointCloud
 from nbtrack.data.sequence import RgbdSequence
 from nbtrack.experiments import runs
+from nbtrack.experiments.scenes import Scene
 from nbtrack.experiments.track_jobs import TrackJob
 from nbtrack.machinery.errors import ConfigError, DataError, look_up
 from nbtrack.machinery.files import naming_damaged, write_atomic
@@ -22,7 +23,7 @@ from nbtrack.plots.meshes import extract_mesh, mesh_bytes
 from nbtrack.plots.movie import rerun_bytes
 from nbtrack.recordings import reading
 from nbtrack.recordings.pose_files import number_lines, read_tum, shifted
-from nbtrack.recordings.recording import Recording, open_recording
+from nbtrack.recordings.recording import Recording
 from nbtrack.tracking import Trajectory
 
 _FRAMES_SHOWN = 20  # an overview shows what 20 to 39 evenly spaced frames saw, or all of fewer
@@ -130,7 +131,10 @@ def _export_run(source: Path, format_name: str) -> tuple[bytes, str]:
     metrics, n_frames = tracked.metrics, len(tracked.frames)
     stored, _ = _map_of(tracked)
     shown = np.unique(np.linspace(0, n_frames - 1, _MOVIE_FRAMES).round().astype(int))
-    seen = _seen(tracked, shown, open_recording(metrics["recording"], metrics["format"]))
+    scene = Scene(metrics["scene"], Path(metrics["recording"]), metrics["format"])
+    if scene.fingerprint != metrics["recording_key"]:
+        raise DataError(f"{scene.folder} is not the recording of this run any more: track again")
+    seen = _seen(tracked, shown, scene.recording)
     surface = _surface(stored.field, seen, 2 * _CELLS)  # with cells half as large as an overview's
     title = f"{metrics['scene']}: {metrics['tracker']} in {stored.field.label}"
     if format_name == "rrd":

@@ -35,7 +35,7 @@ FILES_OF_RUN = ("trajectory.txt", "groundtruth.txt", "frames.csv", OVERVIEW_FILE
 FILES_OF_MAP = (HISTORY_FILE, MESH_FILE, MAP_FILE)
 # What exports use of a run: columns of its frames, and entries of its metrics.
 _COLUMNS = ["frame_id", "time", "translation_error_m", "without_depth"]
-_ENTRIES = dict.fromkeys(("map", "map_key", "recording", "scene", "tracker"), str)
+_ENTRIES = dict.fromkeys(("map", "map_key", "recording", "recording_key", "scene", "tracker"), str)
 _ENTRIES |= {"format": str | None, "origin": tuple[float, float, float]}
 _RESULTS = (*FILES_OF_RUN, *FILES_OF_MAP, CHECK_FILE, "table_[123]*")
 

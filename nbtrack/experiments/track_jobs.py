@@ -1,7 +1,6 @@
 """Runs as jobs. In a run a camera is tracked in a map; errors and their provenance are stored."""
 
 import contextlib
-import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +22,7 @@ from nbtrack.machinery import files
 from nbtrack.machinery.device import choose_device, device_name
 from nbtrack.machinery.errors import DataError, NbtrackError
 from nbtrack.machinery.inputs import read_object
-from nbtrack.machinery.registry import IMPORTED
+from nbtrack.machinery.registry import command_line
 from nbtrack.machinery.settings import as_dict, changed_settings
 from nbtrack.mapping.files import Map
 from nbtrack.tracking import Trajectory, make_budget, make_tracker, track_sequence, tracker_class
@@ -228,6 +227,7 @@ class TrackJob(Job):
             "versions": provenance.versions(),
             "command": self._command(),
             "recording": str(self.scene.folder),
+            "recording_key": self.scene.fingerprint,
             "format": self.scene.format,
             "budget": str(make_budget(self.steps, self.rate_hz)),
             "config": as_dict(self.settings),
@@ -260,11 +260,9 @@ class TrackJob(Job):
             if self.scene.made:
                 sequence = self.scene.name
                 settings["scenes"] = {name: getattr(self.scene.made, name) for name in SIZES}
-        words = ["python", "-m", "nbtrack", "track", sequence]
-        words += [f"--set={text}" for text in changed_settings(settings, default_settings())]
+        words = [f"--set={text}" for text in changed_settings(settings, default_settings())]
         words += [f"--{name}={value}" for name, value in options.items() if value is not None]
-        words += [f"--import={source}" for source in IMPORTED]
-        return shlex.join([*words, "--out", f"again_{self.name}"])
+        return command_line("track", sequence, *words, "--out", f"again_{self.name}")
 
 
 def reach_warnings(runs: Sequence[TrackJob]) -> Iterator[str]:

@@ -108,11 +108,11 @@ def number(name: str, value: Any, minimum: float, maximum: float, kind: type = R
 
 
 def whole_number(name: str, value: Any, minimum: int = 0) -> int:
-    """A whole number of 64 bits from `minimum` on, as an int.
+    """A whole number of 32 bits from `minimum` on, as an int; generators take no larger seed.
 
     Raises ConfigError, whose message calls the number `name`, for any other value.
     """
-    return number(name, value, minimum, 2**63 - 1, Integral)
+    return number(name, value, minimum, 2**32 - 1, Integral)
 
 
 def checked_pose(T_world_camera: Any) -> Float[np.ndarray, "4 4"]:

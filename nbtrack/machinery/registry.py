@@ -7,6 +7,7 @@ imports it, for the option `--import` of every command.
 
 import importlib
 import pkgutil
+import shlex
 import sys
 import traceback
 from collections import UserDict
@@ -48,7 +49,8 @@ class Registry(UserDict[str, Entry]):
             plugin = _waiting.pop(0)
             try:
                 plugin.load()
-            except Exception as error:  # a fault of another package must not stop the program
+            # A fault of another package must not stop the program.
+            except (Exception, SystemExit) as error:
                 why = f"({type(error).__name__}: {error}): mend or remove it"
                 tell(f"nbtrack: warning: plug-in {plugin.value} is left out {why}")
         return self.__dict__["data"]
@@ -72,6 +74,11 @@ class Registry(UserDict[str, Entry]):
                 raise ConfigError(f"{found}: install it, or remove this entry") from error
             self[name] = entry
         return entry
+
+
+def command_line(*words: str) -> str:
+    """A command to copy, which imports the same files of the user's as this one."""
+    return shlex.join(["python", "-m", "nbtrack", *words, *(f"--import={s}" for s in IMPORTED)])
 
 
 def from_extra(package: str, extra: str = "") -> ModuleType:
@@ -99,7 +106,7 @@ def import_own(source: str) -> None:
         sys.path.insert(0, str(file.parent))
     try:
         module = importlib.import_module(name)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a script for the shell ends itself
         place = traceback.extract_tb(error.__traceback__)[-1]
         # An error in Python's import system, as for a missing module, has no line to mend.
         is_in_python = place.filename.startswith("<frozen")

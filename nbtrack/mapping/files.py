@@ -28,7 +28,7 @@ _FORMAT = "nbtrack map"
 _VERSION = 4
 FORMS: Registry[type[Field]] = Registry({})
 """Classes of fields that are made from finished maps, such as corrected ones, by name."""
-_AGAIN = "map again, and give the folder or its map.safetensors; an earlier nbtrack's are none"
+_AGAIN = "remove it and map again; give the folder or its map.safetensors, of this version"
 
 
 @typed
@@ -113,7 +113,7 @@ def read_map(path: Path | str) -> Map:
         stored = _map_of(file.read_bytes(), file)
     if not history.is_file():
         return stored
-    with naming_damaged(history, "history", "remove it, or map again"):
+    with naming_damaged(history, "history", "remove it"):
         return replace(stored, history=pd.read_csv(history, index_col="iteration"))
 
 

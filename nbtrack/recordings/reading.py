@@ -78,7 +78,7 @@ def read_frames(
     images = images_of(recording)
     colors, depths = images.arrays_of(ids)
     depths_mm = depths if as_stored else images.in_millimetres(depths, ids)
-    origin = recording.origin if origin is None else origin
+    origin = np.array(recording.origin if origin is None else origin, dtype=float)
     T_world_camera = shifted(recording.T_world_camera[ids], -origin)
     return RgbdSequence(
         recording.name, images.camera_of(ids[0]), colors, depths_mm, T_world_camera=T_world_camera,

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from nbtrack.fields import field_class
-from nbtrack.machinery.errors import check_argument, look_up, typed
+from nbtrack.machinery.errors import ConfigError, check_argument, look_up, typed
 from nbtrack.machinery.registry import Registry
 from nbtrack.tracking import paper_steps, tracker_class
 
@@ -66,11 +66,14 @@ def find_methods(methods: Methods) -> list[Method]:
     """The methods of a list of names and `Method` objects, in order. Repetitions are left out.
 
     Raises ConfigError if `methods` is no list, if an entry is neither a known name nor a `Method`,
-    or if a method's tracker does not work in its field.
+    if a method's tracker does not work in its field, or if two have one label.
     """
     found = [look_up("method", m, METHODS) if isinstance(m, str) else m for m in methods]
     # Checked here, since what users register in METHODS is not checked when they register it.
     check_argument("methods", found, Sequence[Method])
+    by_label = {method.label: method for method in found}
     for method in found:
+        if method != by_label[method.label]:
+            raise ConfigError(f"two methods have the label {method.label!r}: give one another")
         tracker_class(method.tracker).check_field(field_class(method.field))
-    return [method for place, method in enumerate(found) if method not in found[:place]]
+    return list(by_label.values())

@@ -69,7 +69,7 @@ class Tracker(abc.ABC):
     converges: bool = False  # whether it can end a frame before its budget is spent
     copes_without_depth: bool = False  # whether it searches frames without any measured depth
     # Names of attributes that are kept from one frame to the next. Their values before the first
-    # frame are those of the class.
+    # frame are those of the class. Checkpoints hold tensors, numbers, texts, and lists of these.
     remembers: tuple[str, ...] = ()
     is_converged: bool = False  # whether further steps in this frame would change nothing
     T_world_camera: Transform
@@ -171,7 +171,7 @@ class Tracker(abc.ABC):
         bounds = self.field.bounds
         self.estimates = [checked_start(T_world_camera, bounds.minimum, bounds.maximum)]
         for name in self.remembers:
-            setattr(self, name, getattr(type(self), name))
+            setattr(self, name, deepcopy(getattr(type(self), name)))
 
     def restart_anywhere(self) -> None:
         """Go on from an unknown pose. Raises ConfigError if this tracker cannot find the camera."""
@@ -193,7 +193,7 @@ class Tracker(abc.ABC):
             "estimates": torch.from_numpy(np.stack(self.estimates)),
             "budget": self.budget.memory,
             "generator": self.generator.get_state(),
-            **{name: getattr(self, name) for name in self.remembers},
+            **{name: deepcopy(getattr(self, name)) for name in self.remembers},
         }
 
     def restore(self, state: dict[str, Any]) -> None:
