@@ -51,7 +51,7 @@ def plot_idea(
     points_camera, point_camera = _points_of_row(frame, *pixel)
     distance = point_camera.norm().item()
     x = np.arange(max(-_BEHIND_CAMERA, distance - before), distance + _BEYOND, _STEP)
-    text_height = 1.15 if any(T_world_camera) else 1.1  # inches; more if a panel has a title
+    text_height = 1.3 if any(T_world_camera) else 1.1  # inches; more if a panel has a title
     panel_width = _PANELS_SHARE * WIDTH / len(T_world_camera)
     height = text_height + panel_width * 2 * _ASIDE / (x[-1] - x[0])
     panels = new_axes(title, height, 1, len(T_world_camera), sharey=True)[0]
