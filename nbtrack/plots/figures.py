@@ -257,15 +257,17 @@ def plot_intervals(
 
     Tables have columns `set` (the rows of a panel), `method` (colours), `from` and `to` (the ends
     of the interval), `text` (one for each set, printed right of the panel) and `shown` (whether the
-    mark is filled). With `log` x is logarithmic and a dashed line stands at 1.
+    mark is filled). With `log` x is logarithmic and a dashed line stands at 1. A single method
+    needs no legend.
     """
     sets = list(dict.fromkeys(chain.from_iterable(table["set"] for table in panels.values())))
+    colors = style.method_colors(pd.concat(panels)["method"])
     height = 1.2 + 0.34 * len(sets)
     row = style.new_axes(title, height, 1, len(panels), sharex=True, sharey=True)[0]
     for axes, (name, table) in zip(row, panels.items(), strict=True):
-        for k, (method, color) in enumerate(style.method_colors(table["method"]).items()):
+        for k, (method, color) in enumerate(colors.items()):
             of = table[table["method"] == method]
-            y = of["set"].map(sets.index) + 0.34 * (k - (table["method"].nunique() - 1) / 2)
+            y = of["set"].map(sets.index) + 0.34 * (k - (len(colors) - 1) / 2)
             axes.hlines(y, of["from"], of["to"], color)
             fill = np.where(of["shown"], color, "white")
             axes.scatter(of[x], y, c=fill, edgecolors=color, zorder=3, label=method)
@@ -278,7 +280,8 @@ def plot_intervals(
         style.log_axes(axes, "x" if log else "")
         if log:
             axes.axvline(1, **style.DASHED)
-    return row[0].figure.legend_below()
+    figure = row[0].figure
+    return figure.legend_below() if len(colors) > 1 else figure
 
 
 def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray:
