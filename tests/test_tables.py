@@ -270,14 +270,15 @@ def test_millimetres_where_metres_tie(tmp_path: Path) -> None:
 
 
 def test_means_over_rooms_and_shares_of_rows() -> None:
-    """Catches a room that counts twice because it has two seeds, and wrong intervals: those that
-    leave 0 to 100 % or have no width where nothing is lost.
+    """Catches a room that counts twice because it has two seeds, or once without a number, and
+    wrong intervals: those that leave 0 to 100 % or have no width where nothing is lost.
 
     By hand: 4 cm in one room (2 and 8 with two seeds), 1 cm in the other: the mean is 2 cm, and the
     interval 12.7 standard errors of ln 2 either way, for one degree of freedom. With z = 1.96:
     z²/(10 + z²) of 0 in 10, and 1/2 ± z √(2.5 + z²/4)/(10 + z²) of 5 in 10.
     """
-    rows = {"scene": [*"aab"], "seed": [0, 1, 0], "ate_m": [0.02, 0.08, 0.01], "method": "A"}
+    rows = {"scene": [*"aabc"], "seed": [0, 1, 0, 0], "ate_m": [0.02, 0.08, 0.01, None]}
+    rows["method"] = "A"
     (found,) = over_rooms(pd.DataFrame(rows), ["method"]).itertuples(index=False)
     assert found[:2] == ("A", pytest.approx(0.02))
     assert found[2:] == pytest.approx((0.02 / 2**12.7062, 0.02 * 2**12.7062), rel=1e-3)

@@ -168,7 +168,8 @@ def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd
     """Geometric mean over rooms of a positive column, for groups of rows, and its 95 % interval.
 
     `results` has a row for each run, with a column `scene`; rows with equal values in the columns
-    `by` are a group. Returns a row for each group with the columns `by`, `value`, `from` and `to`.
+    `by` are a group. Rows without a value count nowhere. Returns a row for each group with the
+    columns `by`, `value`, `from` and `to`.
 
     Each room counts once, by the mean over its seeds, since rooms differ more than seeds do. Means
     and the interval, Student's over rooms, are of logarithms (our choice). The interval is NaN for
@@ -177,7 +178,7 @@ def over_rooms(results: pd.DataFrame, by: list[str], value: str = "ate_m") -> pd
     logarithms = np.log(results.set_index([*by, "scene"])[value])
     of_rooms = logarithms.groupby([*by, "scene"], sort=False).mean()
     groups = of_rooms.groupby(by, sort=False)
-    mean, half = groups.mean(), groups.sem() * stdtrit(groups.size() - 1, 0.975)  # half the width
+    mean, half = groups.mean(), groups.sem() * stdtrit(groups.count() - 1, 0.975)  # half the width
     return np.exp(pd.DataFrame({value: mean, "from": mean - half, "to": mean + half})).reset_index()
 
 
