@@ -143,14 +143,14 @@ def test_curves_of_methods_and_sweeps() -> None:
 
 def test_intervals_stand_in_the_row_of_their_set() -> None:
     """Catches a panel that orders its sets by itself, so that rows would have another's label, an
-    interval or a text in another row, a mark filled where nothing is shown, and a legend that names
-    a single method."""
+    interval or a text in another row, a mark filled where nothing is shown, and a legend that does
+    not say what filled marks are."""
     columns = ["set", "method", "share (%)", "from", "to", "text", "shown"]
     rows = [["b", "VR", 50.0, 20.0, 80.0, "9", True], ["a", "VR", 0.0, 0.0, 30.0, "1", False]]
     table = pd.DataFrame(rows, columns=columns)
     panels = {"one": table, "two": table[::-1]}
     figure = plots.plot_intervals(panels, columns[2], "more")
-    assert not figure.legends
+    assert [text.get_text() for text in figure.legends[0].texts] == ["VR", "filled: shown"]
     assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["b", "a"]
     for axes, order in zip(figure.axes, ([0, 1], [1, 0]), strict=True):
         lines, points, _ = axes.collections

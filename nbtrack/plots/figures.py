@@ -257,8 +257,7 @@ def plot_intervals(
 
     Tables have columns `set` (the rows of a panel), `method` (colours), `from` and `to` (the ends
     of the interval), `text` (one for each set, printed right of the panel) and `shown` (whether the
-    mark is filled). With `log` x is logarithmic and a dashed line stands at 1. A single method
-    needs no legend.
+    mark is filled). With `log` x is logarithmic and a dashed line stands at 1.
     """
     sets = list(dict.fromkeys(chain.from_iterable(table["set"] for table in panels.values())))
     colors = style.method_colors(pd.concat(panels)["method"])
@@ -280,8 +279,7 @@ def plot_intervals(
         style.log_axes(axes, "x" if log else "")
         if log:
             axes.axvline(1, **style.DASHED)
-    figure = row[0].figure
-    return figure.legend_below() if len(colors) > 1 else figure
+    return row[0].figure.legend_below()
 
 
 def _side_by_side(axes: Axes, texts: pd.Series, labels: pd.Series) -> np.ndarray:
