@@ -175,10 +175,12 @@ def _contradicted(
     """The rows of `odd` whose frames' surfaces lie apart from those of the frame before or after.
 
     So a wrong pose is told from a camera that was moved between two frames. Surfaces lie apart if
-    the mean gap is three times that of all pairs and 1 mm a metre, or unusual (our choice).
+    the mean gap is three times that of all pairs and 1 mm a metre, or unusual (our choice). Only
+    the `_N_PAIRS` poses that are farthest off are looked at, which bounds the memory.
     """
     if odd.empty:
         return odd
+    odd = odd.nlargest(_N_PAIRS).sort_index()
     at = np.searchsorted(ids, odd.index)
     pairs = np.hstack([[at - 1, at], [at, at + 1]])
     stored = read_frames(recording, ids[np.unique(pairs)], as_stored=True)
